@@ -1,0 +1,148 @@
+"""Learning curves of DSAC against SB3's SAC and sb3-contrib's TQC: same budget, network size and evaluation.
+
+    python benchmarks/learning.py run --jobs 2     # runs what is missing; stop and restart it at any time
+    python benchmarks/learning.py report           # prints the table from the CSVs
+
+Hyperparameters are those of each algorithm's own RL-Zoo3 file (ours for DSAC, the zoo's for SAC and TQC), with
+``net_arch=[256, 256]`` and one torch thread for all. Every evaluation is 10 deterministic episodes on an environment of
+its own seed. The score of a run is the mean of its last three evaluations.
+One CSV per run is written under ``benchmarks/results/learning/<env>/``, a row per evaluation as it comes; a run that was
+cut off starts anew. Seeds 0-2 are the reported ones; tune on seeds from 100.
+"""
+
+import argparse
+import csv
+import importlib.metadata
+import multiprocessing
+import time
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from pathlib import Path
+
+import numpy as np
+import rl_zoo3
+import sb3_contrib.tqc.tqc as tqc
+import torch as th
+import yaml
+from stable_baselines3 import SAC
+from stable_baselines3.common.callbacks import BaseCallback, EveryNTimesteps
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.evaluation import evaluate_policy
+
+RESULTS = Path(__file__).parent / "results" / "learning"
+BUDGETS = {"Pendulum-v1": (20_000, 2_000), "HalfCheetah-v5": (100_000, 10_000), "Hopper-v5": (100_000, 10_000)}
+ALGOS = ("dsac", "sac", "tqc")
+EVAL_EPISODES = 10
+PACKAGES = ("torch", "stable-baselines3", "sb3-contrib", "gymnasium", "mujoco", "numpy")
+
+
+def hyperparameters(algo: str, env_id: str) -> dict:
+    """The entry of the algorithm's RL-Zoo3 yaml, as constructor arguments (the zoo lists MuJoCo tasks as -v4)."""
+    if algo == "dsac":
+        from sb3_chac.zoo import hyperparams_file
+
+        path = hyperparams_file(algo)
+    else:
+        path = Path(rl_zoo3.__file__).parent / "hyperparams" / f"{algo}.yml"
+    entries = yaml.safe_load(path.read_text())
+    params = dict(entries.get(env_id) or entries[env_id.replace("-v5", "-v4")])
+    del params["n_timesteps"]
+    if isinstance(params.get("policy_kwargs"), str):
+        params["policy_kwargs"] = eval(params["policy_kwargs"], {"dict": dict, "nn": th.nn})
+    params["policy_kwargs"] = {**params.get("policy_kwargs", {}), "net_arch": [256, 256]}
+    return params
+
+
+class Evaluate(BaseCallback):
+    """Append one row to the CSV each time it is called."""
+
+    def __init__(self, file, labels: list, eval_env):
+        super().__init__()
+        self.file, self.labels, self.eval_env = file, labels, eval_env
+        versions = " ".join(f"{name}={importlib.metadata.version(name)}" for name in PACKAGES)
+        self.versions = versions
+        csv.writer(file).writerow(["algo", "env", "seed", "step", "return_mean", "return_std", "cpu_seconds", "versions"])
+
+    def _on_step(self) -> bool:
+        mean, std = evaluate_policy(self.model, self.eval_env, n_eval_episodes=EVAL_EPISODES, deterministic=True)
+        row = [self.num_timesteps, f"{mean:.2f}", f"{std:.2f}", f"{time.process_time():.0f}", self.versions]
+        csv.writer(self.file).writerow(self.labels + row)
+        self.file.flush()
+        return True
+
+
+def run(algo: str, env_id: str, seed: int, folder: Path, overrides: dict | None = None) -> str:
+    """Train one agent and write its evaluations to ``folder/<env>/<algo>-<seed>.csv``."""
+    th.set_num_threads(1)
+    # Half of TQC's time goes into this one elementwise loss; compiling it changes its speed, not its value.
+    tqc.quantile_huber_loss = th.compile(tqc.quantile_huber_loss)
+    algorithms = {"sac": SAC, "tqc": tqc.TQC}
+    if algo == "dsac":
+        from sb3_chac import DSAC
+
+        algorithms["dsac"] = DSAC
+
+    budget, eval_freq = BUDGETS[env_id]
+    params = {**hyperparameters(algo, env_id), **(overrides or {})}
+    model = algorithms[algo](env=env_id, seed=seed, device="cpu", **params)
+    eval_env = make_vec_env(env_id, n_envs=1, seed=10_000 + seed)
+    path = folder / env_id / f"{algo}-{seed}.csv"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("w", newline="") as file:
+        model.learn(budget, callback=EveryNTimesteps(eval_freq, Evaluate(file, [algo, env_id, seed], eval_env)))
+    return f"{algo} {env_id} seed {seed}: {time.process_time():.0f} CPU seconds"
+
+
+def read(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def is_finished(path: Path, budget: int) -> bool:
+    rows = read(path) if path.is_file() else []
+    return bool(rows) and int(rows[-1]["step"] or 0) >= budget
+
+
+def run_all(args: argparse.Namespace) -> None:
+    jobs = [
+        (algo, env_id, seed)
+        for env_id in args.envs
+        for seed in args.seeds
+        for algo in args.algos
+        if not is_finished(args.folder / env_id / f"{algo}-{seed}.csv", BUDGETS[env_id][0])
+    ]
+    print(f"{len(jobs)} runs to do")
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(args.jobs, mp_context=context, max_tasks_per_child=1) as pool:
+        futures = {pool.submit(run, *job, args.folder): job for job in jobs}
+        for done, future in enumerate(as_completed(futures), 1):
+            error = future.exception()
+            outcome = f"{futures[future]} failed: {error!r}" if error else future.result()
+            print(f"[{done}/{len(jobs)}] {outcome}", flush=True)
+
+
+def report(args: argparse.Namespace) -> None:
+    print("| environment | algorithm | seeds | return, last 3 evaluations (mean ± std over seeds) | whole curve | CPU s |")
+    print("|---|---|---|---|---|---|")
+    for env_id in args.envs:
+        for algo in args.algos:
+            paths = [args.folder / env_id / f"{algo}-{seed}.csv" for seed in args.seeds]
+            runs = [read(path) for path in paths if is_finished(path, BUDGETS[env_id][0])]
+            if not runs:
+                continue
+            curves = np.array([[float(row["return_mean"]) for row in rows] for rows in runs])
+            final, whole = curves[:, -3:].mean(axis=1), curves.mean(axis=1)
+            cpu = np.mean([float(rows[-1]["cpu_seconds"]) for rows in runs])
+            spread = f"{final.mean():.0f} ± {final.std(ddof=1) if len(final) > 1 else 0:.0f}"
+            print(f"| {env_id} | {algo} | {len(runs)} | {spread} | {whole.mean():.0f} | {cpu:.0f} |")
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("command", choices=["run", "report"])
+    parser.add_argument("--envs", nargs="+", choices=BUDGETS, default=list(BUDGETS))
+    parser.add_argument("--algos", nargs="+", choices=ALGOS, default=list(ALGOS))
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
+    parser.add_argument("--jobs", type=int, default=2, help="processes at once, one torch thread each")
+    parser.add_argument("--folder", type=Path, default=RESULTS)
+    arguments = parser.parse_args()
+    {"run": run_all, "report": report}[arguments.command](arguments)

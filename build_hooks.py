@@ -1,0 +1,46 @@
+"""Put ``sb3_chac.pth`` and ``sb3_chac.start`` into the root of every wheel, so that they land in site-packages.
+
+They make the stock ``rl_zoo3`` command know our algorithms, see ``sb3_chac/_startup.py``.
+"""
+
+from pathlib import Path
+
+from setuptools.command.build_py import build_py
+from setuptools.command.editable_wheel import editable_wheel
+
+STARTUP_FILES = ("sb3_chac.pth", "sb3_chac.start")
+
+
+class BuildPy(build_py):
+    """Wheels and ``pip install .``: copy the files beside the package."""
+
+    def run(self) -> None:
+        super().run()
+        if not self.editable_mode:
+            for name in STARTUP_FILES:
+                self.copy_file(name, str(Path(self.build_lib) / name))
+
+    def get_outputs(self, include_bytecode: bool = True) -> list[str]:
+        return super().get_outputs(include_bytecode) + [str(Path(self.build_lib) / name) for name in STARTUP_FILES]
+
+
+class EditableWheel(editable_wheel):
+    """``pip install -e .``: write the files into the editable wheel too."""
+
+    def _select_strategy(self, *args, **kwargs):
+        strategy = super()._select_strategy(*args, **kwargs)
+
+        class WithStartupFiles:
+            def __enter__(self):
+                strategy.__enter__()
+                return self
+
+            def __exit__(self, *exc_info):
+                return strategy.__exit__(*exc_info)
+
+            def __call__(self, wheel, files, mapping):
+                strategy(wheel, files, mapping)
+                for name in STARTUP_FILES:
+                    wheel.writestr(name, Path(name).read_bytes())
+
+        return WithStartupFiles()

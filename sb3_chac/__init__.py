@@ -1,0 +1,28 @@
+"""Stable-Baselines3 algorithms for confidence-guided human-AI collaboration.
+
+The names below are imported on first use, so that ``import sb3_chac`` itself costs next to nothing.
+"""
+
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from sb3_chac.dsac import DSAC
+
+__version__ = (Path(__file__).parent / "version.txt").read_text().strip()
+
+# Public name -> module that defines it
+_EXPORTS = {"DSAC": "sb3_chac.dsac"}
+
+__all__ = ["DSAC", "__version__"]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _EXPORTS:
+        return getattr(import_module(_EXPORTS[name]), name)
+    raise AttributeError(f"module 'sb3_chac' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_EXPORTS})

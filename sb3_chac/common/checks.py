@@ -1,0 +1,86 @@
+"""Checks of what users hand in. Each raises one exception that names the argument and the remedy."""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+
+
+class UnsupportedActionSpace(ValueError, AssertionError):
+    """Raised for action spaces that an algorithm cannot act in (an ``AssertionError`` too, as in SB3)."""
+
+
+def check_action_space(action_space: spaces.Space) -> None:
+    """
+    :raises UnsupportedActionSpace: unless ``action_space`` is a Box with finite bounds, low < high
+    """
+    if not isinstance(action_space, spaces.Box):
+        raise UnsupportedActionSpace(
+            f"env: the action space must be continuous (gymnasium.spaces.Box), got {action_space}. "
+            "Use an algorithm for discrete actions (DQN, PPO), or wrap the environment to take continuous ones."
+        )
+    if not np.all(np.isfinite(action_space.low) & np.isfinite(action_space.high) & (action_space.low < action_space.high)):
+        raise UnsupportedActionSpace(
+            f"env: the action space must have finite bounds with low < high, got {action_space}. "
+            "Wrap the environment, e.g. in gymnasium.wrappers.RescaleAction or ClipAction."
+        )
+
+
+def check_range(name: str, value: Any, low: float = -math.inf, high: float = math.inf, exclusive_low: bool = False) -> None:
+    """
+    :param name: name of the argument, for the message
+    :param value: a number
+    :param exclusive_low: whether ``low`` itself is refused
+    :raises ValueError: unless ``value`` is a finite number between ``low`` and ``high``
+    """
+    is_number = isinstance(value, int | float | np.number) and not isinstance(value, bool) and math.isfinite(value)
+    if not is_number or not low <= value <= high or (exclusive_low and value == low):
+        left = "above" if exclusive_low else "of at least"
+        limits = f"{left} {low:g}" + (f" and at most {high:g}" if math.isfinite(high) else "")
+        raise ValueError(f"{name} must be a finite number {limits}, got {value!r}.")
+
+
+def check_integer(name: str, value: Any, low: int) -> None:
+    """
+    :raises ValueError: unless ``value`` is an integer of at least ``low``
+    """
+    if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < low:
+        raise ValueError(f"{name} must be an integer of at least {low}, got {value!r}.")
+
+
+def check_learning_rate(name: str, value: float | Callable[[float], float]) -> None:
+    """
+    Zero is allowed: RL-Zoo3's ``enjoy`` loads every model with it.
+
+    :param value: a number, or a schedule of the remaining progress (1 to 0)
+    :raises ValueError: if it is negative or not finite, at the start or at the end of a schedule
+    """
+    for rate in [value(1.0), value(0.0)] if callable(value) else [value]:
+        try:
+            check_range(name, rate, low=0.0)
+        except ValueError as error:
+            raise ValueError(f"{error} Pass a rate such as 3e-4, or a schedule that stays positive.") from None
+
+
+def check_finite(
+    name: str, values: np.ndarray | dict[str, np.ndarray], step: int, env_idx: int | None = None
+) -> None:
+    """
+    :param name: what the values are ("observation", "reward"), for the message
+    :param values: shape (n_envs, ...), or a dictionary of such arrays
+    :param step: total number of steps so far, for the message
+    :param env_idx: the environment that ``values`` come from, if they have no first dimension for it
+    :raises ValueError: if any value is NaN or infinite; names the environment and the key
+    """
+    for key, array in values.items() if isinstance(values, dict) else [(None, values)]:
+        if not np.issubdtype(array.dtype, np.floating) or np.isfinite(array).all():
+            continue
+        if env_idx is None:
+            env_idx = int(np.argmin(np.isfinite(array.reshape(len(array), -1)).all(axis=1)))
+        raise ValueError(
+            f"{name}{'' if key is None else f' {key!r}'} of environment {env_idx} is NaN or infinite at step {step}: "
+            "mend the environment (stable_baselines3.common.vec_env.VecCheckNan finds the origin). "
+            "Nothing of this step was stored; the model and its replay buffer can still be saved."
+        )

@@ -1,0 +1,58 @@
+"""The distributional critic's arithmetic: Gaussian returns Z(s, a) ~ N(Q(s, a), sigma(s, a)^2)."""
+
+import math
+
+import torch as th
+
+
+def gaussian_surrogate_loss(
+    q_values: th.Tensor,
+    stds: th.Tensor,
+    mean_targets: th.Tensor,
+    sampled_targets: th.Tensor,
+    running_std: th.Tensor,
+    eta: float = 1.0,
+    clip_factor: float = 3.0,
+    epsilon: float = 0.1,
+) -> th.Tensor:
+    """
+    Per-sample surrogate of the Gaussian negative log-likelihood, as in DSAC-T (Duan et al. 2023, arXiv 2310.05858,
+    "three refinements"; C-HAC's critic loss). Only its gradient means something, its value does not:
+
+        d/dQ     = -(b^2 + e) (y_q - Q) / (sigma^2 + e)
+        d/dsigma = -(b^2 + e) (d^2 - eta sigma^2) / (sigma^3 + e),      d = clip(y_z - Q, -c b, c b)
+
+    The mean follows the target without sampling noise, the standard deviation follows the sampled target, clipped to
+    ``c`` running standard deviations; the weight ``b^2 + e`` makes the step independent of the scale of the reward.
+    ``eta = 1`` keeps sigma calibrated: in the fixed point ``E[d^2] = eta sigma^2``.
+
+    :param q_values: Q, mean returns, shape (..., batch_size)
+    :param stds: sigma, standard deviations of the return, same shape, positive
+    :param mean_targets: y_q, broadcastable to ``q_values``
+    :param sampled_targets: y_z, broadcastable to ``q_values``
+    :param running_std: b, broadcastable to ``q_values``, e.g. shape (n_critics, 1)
+    :param eta: weight of sigma^2 in the gradient of the standard deviation, > 0
+    :param clip_factor: c
+    :param epsilon: e, keeps the divisions stable
+    :return: shape (..., batch_size), no reduction
+    """
+    with th.no_grad():
+        bound = clip_factor * running_std
+        error = th.clamp(sampled_targets - q_values, -bound, bound)
+        weight = running_std.square() + epsilon
+        variances = stds.square()
+        q_gradient = -weight * (mean_targets - q_values) / (variances + epsilon)
+        std_gradient = -weight * (error.square() - eta * variances) / (variances * stds + epsilon)
+    return q_gradient * q_values + std_gradient * stds
+
+
+def gaussian_nll(q_values: th.Tensor, stds: th.Tensor, sampled_targets: th.Tensor) -> th.Tensor:
+    """
+    Negative log-likelihood of sampled returns, the figure to watch in place of the surrogate's value.
+
+    :param q_values: Q, shape (..., batch_size)
+    :param stds: sigma, same shape
+    :param sampled_targets: y_z, broadcastable to ``q_values``
+    :return: shape (..., batch_size), in nats
+    """
+    return 0.5 * ((sampled_targets - q_values) / stds).square() + stds.log() + 0.5 * math.log(2 * math.pi)

@@ -1,0 +1,114 @@
+import io
+import pathlib
+from typing import Any
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.save_util import load_from_zip_file
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, TensorDict
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_chac.common.checks import check_action_space, check_finite, check_integer, check_learning_rate, check_range
+
+
+class CheckedOffPolicyAlgorithm(OffPolicyAlgorithm):
+    """
+    SB3's OffPolicyAlgorithm for continuous actions, which refuses bad arguments, checkpoints of other algorithms and
+    observations or rewards that are not finite, each with one message, before anything is changed or stored.
+    """
+
+    # What ``policy`` must derive from
+    required_policy: type[BasePolicy]
+
+    def _setup_model(self) -> None:
+        self._check_arguments()
+        super()._setup_model()
+
+    def _check_arguments(self) -> None:
+        """
+        Called on creation and on loading, before anything is built.
+
+        :raises ValueError: names the argument and the remedy
+        """
+        if not issubclass(self.policy_class, self.required_policy):
+            raise ValueError(
+                f"policy: {type(self).__name__} needs a {self.required_policy.__name__}, got {self.policy_class.__name__} "
+                f"(of {self.policy_class.__module__}). If it came from a checkpoint, load that with the class that saved it."
+            )
+        check_learning_rate("learning_rate", self.learning_rate)
+        check_integer("buffer_size", self.buffer_size, low=1)
+        check_integer("batch_size", self.batch_size, low=1)
+        check_integer("learning_starts", self.learning_starts, low=0)
+        check_integer("gradient_steps", self.gradient_steps, low=-1)
+        check_integer("n_steps", self.n_steps, low=1)
+        check_range("tau", self.tau, low=0.0, high=1.0)
+        check_range("gamma", self.gamma, low=0.0, high=1.0)
+
+    @staticmethod
+    def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
+        check_action_space(env.action_space)
+        return BaseAlgorithm._wrap_env(env, verbose, monitor_wrapper)
+
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        reset_num_timesteps: bool = True,
+        tb_log_name: str = "run",
+        progress_bar: bool = False,
+    ) -> tuple[int, BaseCallback]:
+        prepared = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
+        check_finite("observation", self._last_obs, self.num_timesteps)  # type: ignore[arg-type]
+        return prepared
+
+    def _store_transition(
+        self,
+        replay_buffer: ReplayBuffer,
+        buffer_action: np.ndarray,
+        new_obs: np.ndarray | dict[str, np.ndarray],
+        reward: np.ndarray,
+        dones: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        check_finite("reward", reward, self.num_timesteps)
+        check_finite("observation", new_obs, self.num_timesteps)
+        for idx in np.flatnonzero(dones):
+            last_obs = infos[idx].get("terminal_observation")
+            if last_obs is not None:
+                check_finite("terminal observation", last_obs, self.num_timesteps, env_idx=idx)
+        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)  # type: ignore[arg-type]
+
+    def set_parameters(
+        self,
+        load_path_or_dict: str | pathlib.Path | io.BufferedIOBase | TensorDict,
+        exact_match: bool = True,
+        device: th.device | str = "auto",
+    ) -> None:
+        """
+        As in SB3, but parameters of another algorithm or network are refused before any is copied.
+
+        :raises RuntimeError: names what differs (SB3's ``load`` reserves ValueError for other purposes)
+        """
+        params: Any = load_path_or_dict
+        if not isinstance(params, dict):
+            _, params, _ = load_from_zip_file(load_path_or_dict, device=device, load_data=False)  # type: ignore[arg-type]
+        if exact_match:
+            own = self.get_parameters()
+            differing = sorted(params.keys() ^ own.keys())
+            if not differing:
+                shapes, own_shapes = (
+                    {name: tensor.shape for name, tensor in group["policy"].items()} for group in (params, own)
+                )
+                differing = sorted({name for name, _ in shapes.items() ^ own_shapes.items()})
+            if differing:
+                raise RuntimeError(
+                    f"set_parameters: not the parameters of this {type(self).__name__}: {', '.join(differing[:6])}"
+                    f"{', ...' if len(differing) > 6 else ''} differ. Load them into the class, policy_kwargs and ent_coef "
+                    "that saved them. Nothing was changed."
+                )
+        super().set_parameters(params, exact_match, device)

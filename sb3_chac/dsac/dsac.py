@@ -1,0 +1,347 @@
+from typing import Any, ClassVar, TypeVar
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.utils import FloatSchedule, get_parameters_by_name, update_learning_rate
+from stable_baselines3.sac.policies import Actor
+
+from sb3_chac.common.checks import check_integer, check_learning_rate, check_range
+from sb3_chac.common.critics import DistributionalCritic
+from sb3_chac.common.distributional import gaussian_nll, gaussian_surrogate_loss
+from sb3_chac.common.off_policy_algorithm import CheckedOffPolicyAlgorithm
+from sb3_chac.common.utils import frozen, polyak_update
+from sb3_chac.dsac.policies import CnnPolicy, DSACPolicy, MlpPolicy, MultiInputPolicy
+
+SelfDSAC = TypeVar("SelfDSAC", bound="DSAC")
+
+
+class DSAC(CheckedOffPolicyAlgorithm):
+    """
+    Distributional Soft Actor-Critic with three refinements (DSAC-T)
+    Paper: https://arxiv.org/abs/2310.05858 (Duan et al. 2023), after https://arxiv.org/abs/2001.02811 (Duan et al. 2021).
+    It is the base of the methods of "Confidence-Guided Human-AI Collaboration" (C-HAC, Li et al. 2025).
+
+    SAC whose critics learn the distribution of the soft return, Z(s, a) ~ N(Q(s, a), sigma(s, a)^2). With a' from the
+    target actor and m the critic whose target mean is the smaller one::
+
+        y_q = r + gamma (1 - d) (Q_m(s', a') - alpha log pi(a'|s'))           target of the mean
+        y_z = r + gamma (1 - d) (Z_m(s', a') - alpha log pi(a'|s'))           target of the standard deviation
+
+    See ``sb3_chac.common.distributional.gaussian_surrogate_loss`` for the critic's loss.
+
+    Differences from the paper:
+
+    - y_z samples the critic m that y_q uses, so that both targets belong to one distribution.
+    - The divisions are stabilised with +0.1 and the sample is clipped to three standard deviations, as in the
+      authors' experiments. Their later "Huber" form of the loss is not used: it shrinks sigma about 7 times.
+    - The target entropy is counted in actions scaled to [-1, 1], as everywhere in SB3. The authors count it in the
+      environment's units; theirs is ours plus ``sum(log((high - low) / 2))``.
+    - Time limits do not end the return (SB3 bootstraps through truncations).
+
+    :param policy: The policy model to use (MlpPolicy, CnnPolicy, MultiInputPolicy)
+    :param env: The environment to learn from (if registered in Gym, can be str), with a bounded Box action space
+    :param learning_rate: learning rate of the actor and the critics,
+        it can be a function of the current progress remaining (from 1 to 0)
+    :param buffer_size: size of the replay buffer
+    :param learning_starts: how many steps of the model to collect transitions for before learning starts
+    :param batch_size: Minibatch size for each gradient update
+    :param tau: the soft update coefficient of the target networks (between 0 and 1)
+    :param gamma: the discount factor
+    :param train_freq: Update the model every ``train_freq`` steps. Alternatively pass a tuple of frequency and unit
+        like ``(5, "step")`` or ``(2, "episode")``.
+    :param gradient_steps: How many gradient steps to do after each rollout (see ``train_freq``)
+        Set to ``-1`` means to do as many gradient steps as steps done in the environment during the rollout.
+    :param action_noise: the action noise type (None by default), added to the sampled action
+    :param replay_buffer_class: Replay buffer class to use (for instance ``HerReplayBuffer``).
+        If ``None``, it will be automatically selected.
+    :param replay_buffer_kwargs: Keyword arguments to pass to the replay buffer on creation.
+    :param optimize_memory_usage: Enable a memory efficient variant of the replay buffer
+    :param n_steps: When n_step > 1, uses n-step return (with the NStepReplayBuffer) when updating the critics.
+        As in SB3, only with the default replay buffer and not for Dict observations.
+    :param ent_coef: Entropy regularization coefficient alpha. Set it to 'auto' to learn it
+        (and 'auto_0.1' for using 0.1 as initial value)
+    :param target_update_interval: update the target networks every ``target_update_interval`` actor updates
+    :param target_entropy: target entropy when learning ``ent_coef``, 'auto' is minus the number of actions
+    :param ent_coef_lr: learning rate of the entropy coefficient, can be a schedule too
+    :param policy_delay: gradient steps of the critics per update of the actor, the entropy coefficient and all targets
+    :param eta: weight of sigma^2 in the critic's loss; sigma^2 shrinks as 1 / eta, 1 keeps it calibrated
+    :param tau_b: coefficient of the running mean of sigma that scales and clips the critic's loss; ``tau`` if None
+    :param use_sde: Whether to use generalized State Dependent Exploration (gSDE)
+        instead of action noise exploration (default: False)
+    :param sde_sample_freq: Sample a new noise matrix every n steps when using gSDE
+        Default: -1 (only sample at the beginning of the rollout)
+    :param use_sde_at_warmup: Whether to use gSDE instead of uniform sampling
+        during the warm up phase (before learning starts)
+    :param stats_window_size: Window size for the rollout logging, specifying the number of episodes to average
+        the reported success rate, mean episode length, and mean reward over
+    :param tensorboard_log: the log location for tensorboard (if None, no logging)
+    :param policy_kwargs: additional arguments to be passed to the policy on creation, see ``DSACPolicy``
+    :param verbose: Verbosity level: 0 for no output, 1 for info messages (such as device or wrappers used), 2 for
+        debug messages
+    :param seed: Seed for the pseudo random generators
+    :param device: Device (cpu, cuda, ...) on which the code should be run.
+        Setting it to auto, the code will be run on the GPU if possible.
+    :param _init_setup_model: Whether or not to build the network at the creation of the instance
+    :raises ValueError: for an argument out of its range, an action space that is not a bounded Box, or, while learning,
+        an observation or reward that is NaN or infinite
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
+        "MlpPolicy": MlpPolicy,
+        "CnnPolicy": CnnPolicy,
+        "MultiInputPolicy": MultiInputPolicy,
+    }
+    required_policy = DSACPolicy
+    policy: DSACPolicy
+    actor: Actor
+    actor_target: Actor
+    critic: DistributionalCritic
+    critic_target: DistributionalCritic
+    log_ent_coef: th.nn.Parameter
+
+    def __init__(
+        self,
+        policy: str | type[DSACPolicy],
+        env: GymEnv | str,
+        learning_rate: float | Schedule = 1e-4,
+        buffer_size: int = 1_000_000,  # 1e6
+        learning_starts: int = 100,
+        batch_size: int = 256,
+        tau: float = 0.005,
+        gamma: float = 0.99,
+        train_freq: int | tuple[int, str] = 1,
+        gradient_steps: int = 1,
+        action_noise: ActionNoise | None = None,
+        replay_buffer_class: type[ReplayBuffer] | None = None,
+        replay_buffer_kwargs: dict[str, Any] | None = None,
+        optimize_memory_usage: bool = False,
+        n_steps: int = 1,
+        ent_coef: str | float = "auto",
+        target_update_interval: int = 1,
+        target_entropy: str | float = "auto",
+        ent_coef_lr: float | Schedule = 3e-4,
+        policy_delay: int = 2,
+        eta: float = 1.0,
+        tau_b: float | None = None,
+        use_sde: bool = False,
+        sde_sample_freq: int = -1,
+        use_sde_at_warmup: bool = False,
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        policy_kwargs: dict[str, Any] | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: th.device | str = "auto",
+        _init_setup_model: bool = True,
+    ):
+        super().__init__(
+            policy,
+            env,
+            learning_rate,
+            buffer_size,
+            learning_starts,
+            batch_size,
+            tau,
+            gamma,
+            train_freq,
+            gradient_steps,
+            action_noise,
+            replay_buffer_class=replay_buffer_class,
+            replay_buffer_kwargs=replay_buffer_kwargs,
+            optimize_memory_usage=optimize_memory_usage,
+            n_steps=n_steps,
+            policy_kwargs=policy_kwargs,
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            verbose=verbose,
+            device=device,
+            seed=seed,
+            use_sde=use_sde,
+            sde_sample_freq=sde_sample_freq,
+            use_sde_at_warmup=use_sde_at_warmup,
+            support_multi_env=True,
+        )
+
+        self.ent_coef = ent_coef
+        self.target_update_interval = target_update_interval
+        self.target_entropy = target_entropy
+        self.ent_coef_lr = ent_coef_lr
+        self.ent_coef_optimizer: th.optim.Adam | None = None
+        self.policy_delay = policy_delay
+        self.eta = eta
+        self.tau_b = tau_b
+
+        if _init_setup_model:
+            self._setup_model()
+
+    def _setup_model(self) -> None:
+        super()._setup_model()
+        self._create_aliases()
+        # Batch norm statistics are copied to the targets, not averaged (as in SB3, GH issue #996)
+        self.batch_norm_stats = get_parameters_by_name(self.critic, ["running_"])
+        self.batch_norm_stats += get_parameters_by_name(self.actor, ["running_"])
+        self.batch_norm_stats_target = get_parameters_by_name(self.critic_target, ["running_"])
+        self.batch_norm_stats_target += get_parameters_by_name(self.actor_target, ["running_"])
+        self.ent_coef_lr_schedule = FloatSchedule(self.ent_coef_lr)
+
+        if self.target_entropy == "auto":
+            self.target_entropy = -float(np.prod(self.action_space.shape))  # type: ignore[arg-type]
+
+        learn_ent_coef = isinstance(self.ent_coef, str)
+        with th.no_grad():
+            self.log_ent_coef.fill_(self._initial_ent_coef()).log_()
+        self.log_ent_coef.requires_grad_(learn_ent_coef)
+        if learn_ent_coef:
+            self.ent_coef_optimizer = th.optim.Adam([self.log_ent_coef], lr=self.ent_coef_lr_schedule(1.0))
+
+    def _create_aliases(self) -> None:
+        self.actor = self.policy.actor
+        self.actor_target = self.policy.actor_target
+        self.critic = self.policy.critic
+        self.critic_target = self.policy.critic_target
+        self.log_ent_coef = self.policy.log_ent_coef
+
+    def _initial_ent_coef(self) -> float:
+        """
+        :return: alpha at the start: 1 for 'auto', x for 'auto_x' and for the number x
+        """
+        if not isinstance(self.ent_coef, str):
+            check_range("ent_coef", self.ent_coef, low=0.0)
+            return float(self.ent_coef)
+        kind, _, value = self.ent_coef.partition("_")
+        try:
+            initial = float(value) if value else 1.0
+        except ValueError:
+            initial = -1.0
+        if kind != "auto" or initial <= 0:
+            raise ValueError(f"ent_coef must be 'auto', 'auto_0.1' (0.1 to start with) or a number, got {self.ent_coef!r}.")
+        return initial
+
+    def _check_arguments(self) -> None:
+        super()._check_arguments()
+        check_learning_rate("ent_coef_lr", self.ent_coef_lr)
+        check_integer("target_update_interval", self.target_update_interval, low=1)
+        check_integer("policy_delay", self.policy_delay, low=1)
+        check_range("eta", self.eta, low=0.0, exclusive_low=True)
+        if self.tau_b is not None:
+            check_range("tau_b", self.tau_b, low=0.0, high=1.0)
+        if self.target_entropy != "auto":
+            check_range("target_entropy", self.target_entropy)
+        self._initial_ent_coef()
+
+    def train(self, gradient_steps: int, batch_size: int = 64) -> None:
+        # Switch to train mode (this affects batch norm / dropout)
+        self.policy.set_training_mode(True)
+        # Update learning rates according to their schedules
+        self._update_learning_rate([self.actor.optimizer, self.critic.optimizer])
+        if self.ent_coef_optimizer is not None:
+            update_learning_rate(self.ent_coef_optimizer, self.ent_coef_lr_schedule(self._current_progress_remaining))
+        tau_b = self.tau if self.tau_b is None else self.tau_b
+        critic_params = self.critic.optimizer.param_groups[0]["params"]
+        # Kept as tensors and read only once, at the end
+        critic_stats, actor_stats = [], []
+
+        for _ in range(gradient_steps):
+            self._n_updates += 1
+            # Sample replay buffer
+            replay_data = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)  # type: ignore[union-attr]
+            # For n-step replay, discount factor is gamma**n_steps (when no early termination)
+            discounts = replay_data.discounts.flatten() if replay_data.discounts is not None else self.gamma
+            rewards, dones = replay_data.rewards.flatten(), replay_data.dones.flatten()
+            ent_coef = self.log_ent_coef.detach().exp()
+
+            # We need to sample because `log_std` may have changed between two gradient steps
+            if self.use_sde:
+                self.policy.reset_noise()
+
+            with th.no_grad():
+                # a' from the target actor; mean and sample from the target critic with the smaller mean
+                next_actions, next_log_prob = self.actor_target.action_log_prob(replay_data.next_observations)
+                next_q_values, next_stds = self.critic_target(replay_data.next_observations, next_actions)
+                smaller = next_q_values.argmin(dim=0, keepdim=True)
+                next_q = next_q_values.gather(0, smaller).squeeze(0)
+                next_z = next_q + th.randn_like(next_q).clamp_(-3, 3) * next_stds.gather(0, smaller).squeeze(0)
+                # y_q and y_z, shape (batch_size,)
+                entropy_term = ent_coef * next_log_prob
+                mean_targets = rewards + (1 - dones) * discounts * (next_q - entropy_term)
+                sampled_targets = rewards + (1 - dones) * discounts * (next_z - entropy_term)
+
+            # Optimize the critics, all shapes (n_critics, batch_size)
+            q_values, stds = self.critic(replay_data.observations, replay_data.actions)
+            mean_std = self.critic.update_mean_std(stds, tau_b)
+            losses = gaussian_surrogate_loss(q_values, stds, mean_targets, sampled_targets, mean_std, self.eta)
+            self.critic.optimizer.zero_grad()
+            losses.mean(dim=1).sum().backward()
+            self.critic.optimizer.step()
+            with th.no_grad():
+                nll = gaussian_nll(q_values, stds, sampled_targets).mean()
+                critic_stats.append(th.stack([nll, q_values.mean(), stds.mean()]))
+
+            if self._n_updates % self.policy_delay != 0:
+                continue
+
+            # Optimize the actor against the smaller mean
+            actions_pi, log_prob = self.actor.action_log_prob(replay_data.observations)
+            with frozen(critic_params):
+                q_values_pi, _ = self.critic(replay_data.observations, actions_pi)
+                actor_loss = (ent_coef * log_prob - q_values_pi.min(dim=0).values).mean()
+                self.actor.optimizer.zero_grad()
+                actor_loss.backward()
+            self.actor.optimizer.step()
+
+            # Optimize the entropy coefficient, alpha in the paper
+            entropy = -log_prob.detach().mean()
+            if self.ent_coef_optimizer is not None:
+                ent_coef_loss = (self.log_ent_coef * (entropy - self.target_entropy)).mean()
+                self.ent_coef_optimizer.zero_grad()
+                ent_coef_loss.backward()
+                self.ent_coef_optimizer.step()
+            actor_stats.append(th.stack([actor_loss.detach(), entropy, ent_coef.squeeze()]))
+
+            # Update target networks
+            if (self._n_updates // self.policy_delay) % self.target_update_interval == 0:
+                polyak_update(self.critic.parameters(), self.critic_target.parameters(), self.tau)
+                polyak_update(self.actor.parameters(), self.actor_target.parameters(), self.tau)
+                polyak_update(self.batch_norm_stats, self.batch_norm_stats_target, 1.0)
+
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        self._record_means(["critic_nll", "q_mean", "sigma_mean"], critic_stats)
+        self._record_means(["actor_loss", "entropy", "ent_coef"], actor_stats)
+
+    def _record_means(self, names: list[str], stats: list[th.Tensor]) -> None:
+        if stats:
+            for name, mean in zip(names, th.stack(stats).mean(dim=0).tolist(), strict=True):
+                self.logger.record(f"train/{name}", mean)
+
+    def learn(
+        self: SelfDSAC,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 4,
+        tb_log_name: str = "DSAC",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> SelfDSAC:
+        return super().learn(
+            total_timesteps=total_timesteps,
+            callback=callback,
+            log_interval=log_interval,
+            tb_log_name=tb_log_name,
+            reset_num_timesteps=reset_num_timesteps,
+            progress_bar=progress_bar,
+        )
+
+    def _excluded_save_params(self) -> list[str]:
+        # Aliases of what the policy holds
+        aliases = ["actor", "actor_target", "critic", "critic_target", "log_ent_coef"]
+        return [*super()._excluded_save_params(), *aliases, "batch_norm_stats", "batch_norm_stats_target"]
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        state_dicts = ["policy", "actor.optimizer", "critic.optimizer"]
+        if self.ent_coef_optimizer is not None:
+            state_dicts.append("ent_coef_optimizer")
+        return state_dicts, []

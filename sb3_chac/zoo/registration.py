@@ -1,0 +1,64 @@
+"""What RL-Zoo3 has to be told of our algorithms."""
+
+import functools
+import importlib
+import inspect
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import sb3_chac
+
+# Names on RL-Zoo3's command line -> public class
+ALGORITHMS = {"dsac": "DSAC"}
+
+
+def hyperparams_file(algo: str) -> Path:
+    """
+    :param algo: name on RL-Zoo3's command line, e.g. "dsac"
+    :return: our default hyperparameters: inside an installed package, beside it in a checkout (editable install)
+    :raises FileNotFoundError: if there is none
+    """
+    package = Path(sb3_chac.__file__).parent
+    for folder in (package, package.parent):
+        path = folder / "hyperparams" / f"{algo}.yml"
+        if path.is_file():
+            return path
+    raise FileNotFoundError(f"sb3_chac has no hyperparameters for {algo!r}, choose from {sorted(ALGORITHMS)}.")
+
+
+def register() -> None:
+    """Add our algorithms, hyperparameters and Optuna samplers to RL-Zoo3. Calling it again changes nothing."""
+    add_algorithms(importlib.import_module("rl_zoo3.utils"))
+    add_experiments(importlib.import_module("rl_zoo3.exp_manager"))
+
+
+def add_algorithms(utils: ModuleType) -> None:
+    """
+    :param utils: ``rl_zoo3.utils``, whose ``ALGOS`` the rest of RL-Zoo3 shares by reference
+    """
+    utils.ALGOS.update({algo: getattr(sb3_chac, name) for algo, name in ALGORITHMS.items()})
+
+
+def add_experiments(exp_manager: ModuleType) -> None:
+    """
+    :param exp_manager: ``rl_zoo3.exp_manager``
+    """
+    from sb3_chac.zoo.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
+
+    exp_manager.HYPERPARAMS_SAMPLER.update(HYPERPARAMS_SAMPLER)
+    exp_manager.HYPERPARAMS_CONVERTER.update(HYPERPARAMS_CONVERTER)
+
+    original = exp_manager.ExperimentManager.__init__
+    if hasattr(original, "__wrapped__"):
+        return
+    signature = inspect.signature(original)
+
+    @functools.wraps(original)
+    def with_our_hyperparams(*args: Any, **kwargs: Any) -> None:
+        arguments = signature.bind(*args, **kwargs).arguments
+        if arguments["algo"] in ALGORITHMS and not arguments.get("config"):
+            arguments["config"] = str(hyperparams_file(arguments["algo"]))
+        original(**arguments)
+
+    exp_manager.ExperimentManager.__init__ = with_our_hyperparams
