@@ -48,4 +48,4 @@ class _ZooFinder:
 def install() -> None:
     """Put the import hook in place, once."""
     if not os.environ.get("SB3_CHAC_NO_AUTOLOAD") and not any(type(finder) is _ZooFinder for finder in sys.meta_path):
-        sys.meta_path.insert(0, _ZooFinder())  # type: ignore[arg-type]
+        sys.meta_path.insert(0, _ZooFinder())

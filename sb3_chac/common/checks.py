@@ -12,6 +12,10 @@ class UnsupportedActionSpace(ValueError, AssertionError):
     """Raised for action spaces that an algorithm cannot act in (an ``AssertionError`` too, as in SB3)."""
 
 
+class MismatchedParameters(ValueError, RuntimeError):
+    """Raised for parameters of another algorithm or network (SB3 and torch raise one or the other of its bases)."""
+
+
 def check_action_space(action_space: spaces.Space) -> None:
     """
     :raises UnsupportedActionSpace: unless ``action_space`` is a Box with finite bounds, low < high
@@ -64,9 +68,7 @@ def check_learning_rate(name: str, value: float | Callable[[float], float]) -> N
             raise ValueError(f"{error} Pass a rate such as 3e-4, or a schedule that stays positive.") from None
 
 
-def check_finite(
-    name: str, values: np.ndarray | dict[str, np.ndarray], step: int, env_idx: int | None = None
-) -> None:
+def check_finite(name: str, values: np.ndarray | dict[str, np.ndarray], step: int, env_idx: int | None = None) -> None:
     """
     :param name: what the values are ("observation", "reward"), for the message
     :param values: shape (n_envs, ...), or a dictionary of such arrays
@@ -74,7 +76,8 @@ def check_finite(
     :param env_idx: the environment that ``values`` come from, if they have no first dimension for it
     :raises ValueError: if any value is NaN or infinite; names the environment and the key
     """
-    for key, array in values.items() if isinstance(values, dict) else [(None, values)]:
+    for key, value in values.items() if isinstance(values, dict) else [(None, values)]:
+        array = np.asarray(value)
         if not np.issubdtype(array.dtype, np.floating) or np.isfinite(array).all():
             continue
         if env_idx is None:

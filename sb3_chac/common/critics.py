@@ -1,7 +1,7 @@
 """Twin Gaussian return distributions as one module."""
 
-import math
 from contextlib import nullcontext
+from itertools import pairwise
 
 import torch as th
 from gymnasium import spaces
@@ -11,33 +11,10 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 
+from sb3_chac.common.linear import StackedLinear, use_fast_linear
+
 # Keeps sigma positive where softplus underflows
 MIN_STD = 1e-6
-
-
-class StackedLinear(nn.Module):
-    """
-    ``n_stack`` independent linear layers of one shape, evaluated in one batched product.
-
-    :param n_stack: number of layers
-    :param in_features: size of each input
-    :param out_features: size of each output
-    """
-
-    def __init__(self, n_stack: int, in_features: int, out_features: int):
-        super().__init__()
-        self.weight = nn.Parameter(th.empty(n_stack, in_features, out_features))
-        self.bias = nn.Parameter(th.empty(n_stack, 1, out_features))
-        bound = 1 / math.sqrt(in_features)  # as nn.Linear
-        nn.init.uniform_(self.weight, -bound, bound)
-        nn.init.uniform_(self.bias, -bound, bound)
-
-    def forward(self, inputs: th.Tensor) -> th.Tensor:
-        """
-        :param inputs: shape (n_stack, batch_size, in_features)
-        :return: shape (n_stack, batch_size, out_features)
-        """
-        return th.baddbmm(self.bias, inputs, self.weight)
 
 
 class DistributionalCritic(BaseModel):
@@ -80,9 +57,10 @@ class DistributionalCritic(BaseModel):
         self.n_critics = n_critics
         layers: list[nn.Module] = []
         sizes = [features_dim + get_action_dim(action_space), *net_arch]
-        for in_features, out_features in zip(sizes[:-1], sizes[1:], strict=True):
+        for in_features, out_features in pairwise(sizes):
             layers += [StackedLinear(n_critics, in_features, out_features), activation_fn()]
         self.z_networks = nn.Sequential(*layers, StackedLinear(n_critics, sizes[-1], 2))
+        use_fast_linear(self.features_extractor)
         self.register_buffer("mean_std", th.zeros(n_critics, 1))
 
     def forward(self, obs: PyTorchObs, actions: th.Tensor) -> tuple[th.Tensor, th.Tensor]:

@@ -56,3 +56,18 @@ def gaussian_nll(q_values: th.Tensor, stds: th.Tensor, sampled_targets: th.Tenso
     :return: shape (..., batch_size), in nats
     """
     return 0.5 * ((sampled_targets - q_values) / stds).square() + stds.log() + 0.5 * math.log(2 * math.pi)
+
+
+def clipped_normal_like(values: th.Tensor, bound: float = 3.0) -> th.Tensor:
+    """
+    Standard normal noise, clipped to ``[-bound, bound]`` and rescaled to unit variance. Without the rescaling the
+    half percent of variance that clipping at 3 takes away would compound over the horizon: sigma would come out 10 %
+    too small at gamma 0.99.
+
+    :param values: gives the shape, dtype and device
+    :param bound: largest deviation before rescaling, in standard deviations
+    """
+    inside = math.erf(bound / math.sqrt(2))
+    density = math.exp(-0.5 * bound**2) / math.sqrt(2 * math.pi)
+    variance = inside - 2 * bound * density + bound**2 * (1 - inside)
+    return th.randn_like(values).clamp_(-bound, bound).div_(math.sqrt(variance))

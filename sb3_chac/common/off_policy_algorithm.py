@@ -13,7 +13,14 @@ from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, TensorDict
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_chac.common.checks import check_action_space, check_finite, check_integer, check_learning_rate, check_range
+from sb3_chac.common.checks import (
+    MismatchedParameters,
+    check_action_space,
+    check_finite,
+    check_integer,
+    check_learning_rate,
+    check_range,
+)
 
 
 class CheckedOffPolicyAlgorithm(OffPolicyAlgorithm):
@@ -77,11 +84,10 @@ class CheckedOffPolicyAlgorithm(OffPolicyAlgorithm):
     ) -> None:
         check_finite("reward", reward, self.num_timesteps)
         check_finite("observation", new_obs, self.num_timesteps)
-        for idx in np.flatnonzero(dones):
-            last_obs = infos[idx].get("terminal_observation")
-            if last_obs is not None:
-                check_finite("terminal observation", last_obs, self.num_timesteps, env_idx=idx)
-        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)  # type: ignore[arg-type]
+        for idx, info in enumerate(infos):
+            if info.get("terminal_observation") is not None:
+                check_finite("terminal observation", info["terminal_observation"], self.num_timesteps, env_idx=idx)
+        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
 
     def set_parameters(
         self,
@@ -92,7 +98,7 @@ class CheckedOffPolicyAlgorithm(OffPolicyAlgorithm):
         """
         As in SB3, but parameters of another algorithm or network are refused before any is copied.
 
-        :raises RuntimeError: names what differs (SB3's ``load`` reserves ValueError for other purposes)
+        :raises MismatchedParameters: names what differs
         """
         params: Any = load_path_or_dict
         if not isinstance(params, dict):
@@ -106,7 +112,7 @@ class CheckedOffPolicyAlgorithm(OffPolicyAlgorithm):
                 )
                 differing = sorted({name for name, _ in shapes.items() ^ own_shapes.items()})
             if differing:
-                raise RuntimeError(
+                raise MismatchedParameters(
                     f"set_parameters: not the parameters of this {type(self).__name__}: {', '.join(differing[:6])}"
                     f"{', ...' if len(differing) > 6 else ''} differ. Load them into the class, policy_kwargs and ent_coef "
                     "that saved them. Nothing was changed."

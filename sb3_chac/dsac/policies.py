@@ -1,4 +1,4 @@
-from typing import Any
+from typing import Any, ClassVar
 
 import torch as th
 from gymnasium import spaces
@@ -8,6 +8,7 @@ from stable_baselines3.sac.policies import Actor, SACPolicy
 from torch import nn
 
 from sb3_chac.common.critics import DistributionalCritic
+from sb3_chac.common.linear import use_fast_linear
 
 
 class DSACPolicy(SACPolicy):
@@ -24,7 +25,7 @@ class DSACPolicy(SACPolicy):
     :param log_std_init: Initial value for the log standard deviation (gSDE)
     :param use_expln: Use ``expln()`` instead of ``exp()`` for a positive standard deviation (gSDE)
     :param clip_mean: Clip the mean output (gSDE)
-    :param features_extractor_class: Features extractor to use
+    :param features_extractor_class: Features extractor to use, by default the one that fits the observations
     :param features_extractor_kwargs: Keyword arguments of the features extractor
     :param normalize_images: Whether to divide images by 255
     :param optimizer_class: Optimizer of the actor and the critics
@@ -33,6 +34,7 @@ class DSACPolicy(SACPolicy):
     :param share_features_extractor: Whether actor and critics share the features extractor (learned by the actor's loss)
     """
 
+    default_features_extractor: ClassVar[type[BaseFeaturesExtractor]] = FlattenExtractor
     actor_target: Actor
     critic: DistributionalCritic  # type: ignore[assignment]
     critic_target: DistributionalCritic  # type: ignore[assignment]
@@ -48,7 +50,7 @@ class DSACPolicy(SACPolicy):
         log_std_init: float = -3,
         use_expln: bool = False,
         clip_mean: float = 2.0,
-        features_extractor_class: type[BaseFeaturesExtractor] = FlattenExtractor,
+        features_extractor_class: type[BaseFeaturesExtractor] | None = None,
         features_extractor_kwargs: dict[str, Any] | None = None,
         normalize_images: bool = True,
         optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,
@@ -68,7 +70,7 @@ class DSACPolicy(SACPolicy):
             log_std_init,
             use_expln,
             clip_mean,
-            features_extractor_class,
+            features_extractor_class or self.default_features_extractor,
             features_extractor_kwargs,
             normalize_images,
             optimizer_class,
@@ -85,6 +87,11 @@ class DSACPolicy(SACPolicy):
         # Set and, if "auto", learned by the algorithm
         self.log_ent_coef = nn.Parameter(th.zeros(1, device=self.device))
 
+    def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Actor:
+        actor = super().make_actor(features_extractor)
+        use_fast_linear(actor)
+        return actor
+
     def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> DistributionalCritic:  # type: ignore[override]
         critic_kwargs = self._update_features_extractor(self.critic_kwargs, features_extractor)
         return DistributionalCritic(**critic_kwargs).to(self.device)
@@ -98,22 +105,12 @@ MlpPolicy = DSACPolicy
 
 
 class CnnPolicy(DSACPolicy):
-    """
-    Policy class for image observations: as ``DSACPolicy``, with the CNN of the DQN Nature paper as features extractor.
-    """
+    """Policy for image observations: ``DSACPolicy`` with the CNN of the DQN Nature paper as features extractor."""
 
-    def __init__(
-        self, *args: Any, features_extractor_class: type[BaseFeaturesExtractor] = NatureCNN, **kwargs: Any
-    ):
-        super().__init__(*args, features_extractor_class=features_extractor_class, **kwargs)
+    default_features_extractor = NatureCNN
 
 
 class MultiInputPolicy(DSACPolicy):
-    """
-    Policy class for Dict observations: as ``DSACPolicy``, with one features extractor per key.
-    """
+    """Policy for Dict observations: ``DSACPolicy`` with one features extractor per key."""
 
-    def __init__(
-        self, *args: Any, features_extractor_class: type[BaseFeaturesExtractor] = CombinedExtractor, **kwargs: Any
-    ):
-        super().__init__(*args, features_extractor_class=features_extractor_class, **kwargs)
+    default_features_extractor = CombinedExtractor
