@@ -11,6 +11,8 @@ from typing import Any
 import torch as th
 from torch import nn
 
+# Below this many rows the detour costs more than it saves (predict() on one observation)
+MIN_BATCH_SIZE = 32
 HAS_ONEDNN = th.backends.mkldnn.is_available() and hasattr(th.ops.mkldnn, "_linear_pointwise")
 
 
@@ -44,7 +46,8 @@ def linear(inputs: th.Tensor, weight: th.Tensor, bias: th.Tensor) -> th.Tensor:
     :param bias: shape (out_features,)
     :return: ``inputs @ weight.t() + bias``, shape (batch_size, out_features)
     """
-    if HAS_ONEDNN and inputs.dim() == 2 and inputs.device.type == "cpu" and inputs.dtype == weight.dtype == th.float32:
+    is_float_matrix = inputs.dim() == 2 and inputs.dtype == weight.dtype == th.float32
+    if HAS_ONEDNN and is_float_matrix and inputs.device.type == "cpu" and len(inputs) >= MIN_BATCH_SIZE:
         return OneDnnLinearFunction.apply(inputs, weight, bias)
     return nn.functional.linear(inputs, weight, bias)
 
