@@ -12,7 +12,7 @@ demo: $(INSTALLED)
 	$(BIN)/rl_zoo3 enjoy --algo dsac --env Pendulum-v1 --no-render -n 4000 --folder logs
 
 test: lint type
-	$(BIN)/python -m pytest -n 2
+	$(BIN)/python -m pytest -n 2 --dist loadfile
 
 lint: $(INSTALLED)
 	$(BIN)/ruff check .

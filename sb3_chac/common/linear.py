@@ -1,19 +1,31 @@
 """
-Linear layers that use oneDNN on the CPU.
+Linear layers that use oneDNN on the processors where MKL is slow.
 
-torch's CPU build multiplies float32 matrices with MKL, which keeps to AVX2 on processors other than Intel's. oneDNN comes
-with torch too and does not: products of 256 x 256 take half the time on a Zen 5 core, see benchmarks/NOTES.md.
+torch's CPU build multiplies float32 matrices with MKL, which takes its AVX-512 code on Intel's processors only. oneDNN comes
+with torch too and takes it on all: products of 256 x 256 in half the time on AMD's Zen 5. On Intel's, MKL is the faster one
+for a training step (benchmarks/NOTES.md).
 """
 
 import math
+from pathlib import Path
 from typing import Any
 
 import torch as th
 from torch import nn
 
+
+def mkl_is_held_back() -> bool:
+    """Whether the processor has AVX-512 and is not Intel's (Linux only: elsewhere we do not know, and say no)."""
+    cpuinfo = Path("/proc/cpuinfo")
+    if not th.backends.cpu.get_cpu_capability().startswith("AVX512") or not cpuinfo.is_file():
+        return False
+    with cpuinfo.open() as file:
+        return "GenuineIntel" not in file.read(1000)  # the first processor's vendor_id
+
+
+USE_ONEDNN = th.backends.mkldnn.is_available() and hasattr(th.ops.mkldnn, "_linear_pointwise") and mkl_is_held_back()
 # Below this many rows the detour costs more than it saves (predict() on one observation)
 MIN_BATCH_SIZE = 32
-HAS_ONEDNN = th.backends.mkldnn.is_available() and hasattr(th.ops.mkldnn, "_linear_pointwise")
 
 
 class OneDnnLinearFunction(th.autograd.Function):
@@ -47,7 +59,7 @@ def linear(inputs: th.Tensor, weight: th.Tensor, bias: th.Tensor) -> th.Tensor:
     :return: ``inputs @ weight.t() + bias``, shape (batch_size, out_features)
     """
     is_float_matrix = inputs.dim() == 2 and inputs.dtype == weight.dtype == th.float32
-    if HAS_ONEDNN and is_float_matrix and inputs.device.type == "cpu" and len(inputs) >= MIN_BATCH_SIZE:
+    if USE_ONEDNN and is_float_matrix and inputs.device.type == "cpu" and len(inputs) >= MIN_BATCH_SIZE:
         return OneDnnLinearFunction.apply(inputs, weight, bias)
     return nn.functional.linear(inputs, weight, bias)
 
@@ -81,7 +93,7 @@ class StackedLinear(nn.Module):
         :param inputs: shape (n_stack, batch_size, in_features)
         :return: shape (n_stack, batch_size, out_features)
         """
-        if inputs.device.type == "cpu":
+        if USE_ONEDNN and inputs.device.type == "cpu":
             return th.stack([linear(*layer) for layer in zip(inputs, self.weight, self.bias, strict=True)])
         return th.baddbmm(self.bias.unsqueeze(1), inputs, self.weight.transpose(1, 2))
 

@@ -26,7 +26,7 @@ def frozen(params: Iterable[th.Tensor]) -> Iterator[None]:
     Compute no gradients for ``params`` inside the block, only through them: half the backward pass of a critic when
     the actor is updated.
     """
-    params = list(params)
+    params = [param for param in params if param.requires_grad]
     for param in params:
         param.requires_grad_(False)
     try:
