@@ -86,7 +86,7 @@ def test_action_spaces(action_space, message):
         {"eta": 0.0},
         {"tau_b": 2.0},
     ],
-    ids=str,
+    ids=lambda kwargs: "-".join(f"{name}={value if not callable(value) else 'schedule'}" for name, value in kwargs.items()),
 )
 def test_arguments_out_of_range(kwargs):
     (name,) = kwargs
