@@ -126,19 +126,33 @@ def run_all(args: argparse.Namespace) -> None:
 
 
 def report(args: argparse.Namespace) -> None:
-    print("| environment | algorithm | seeds | return, last 3 evaluations (mean ± std over seeds) | whole curve | CPU s |")
-    print("|---|---|---|---|---|---|")
-    for env_id in args.envs:
+    """Print the table and draw the curves (mean over seeds, shaded from the worst to the best seed)."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    figure, axes = plt.subplots(1, len(args.envs), figsize=(4.2 * len(args.envs), 3.2), squeeze=False)
+    print("| environment | algorithm | seeds | return, last 3 evaluations (mean ± std over seeds) | mean of the whole curve |")
+    print("|---|---|---|---|---|")
+    for env_id, axis in zip(args.envs, axes[0], strict=True):
         for algo in args.algos:
             paths = [args.folder / env_id / f"{algo}-{seed}.csv" for seed in args.seeds]
             runs = [read(path) for path in paths if is_finished(path, BUDGETS[env_id][0])]
             if not runs:
                 continue
+            steps = [int(row["step"]) for row in runs[0]]
             curves = np.array([[float(row["return_mean"]) for row in rows] for rows in runs])
-            final, whole = curves[:, -3:].mean(axis=1), curves.mean(axis=1)
-            cpu = np.mean([float(rows[-1]["cpu_seconds"]) for rows in runs])
-            spread = f"{final.mean():.0f} ± {final.std(ddof=1) if len(final) > 1 else 0:.0f}"
-            print(f"| {env_id} | {algo} | {len(runs)} | {spread} | {whole.mean():.0f} | {cpu:.0f} |")
+            final = curves[:, -3:].mean(axis=1)
+            spread = f" ± {final.std(ddof=1):.0f}" if len(final) > 1 else ""
+            print(f"| {env_id} | {algo} | {len(runs)} | {final.mean():.0f}{spread} | {curves.mean():.0f} |")
+            (line,) = axis.plot(steps, curves.mean(axis=0), label=algo.upper())
+            axis.fill_between(steps, curves.min(axis=0), curves.max(axis=0), color=line.get_color(), alpha=0.15)
+        axis.set(title=env_id, xlabel="environment steps", ylabel="evaluation return")
+        if axis.lines:
+            axis.legend(loc="lower right")
+    figure.tight_layout()
+    figure.savefig(args.folder / "curves.png", dpi=90)
 
 
 if __name__ == "__main__":

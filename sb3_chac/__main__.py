@@ -8,13 +8,18 @@ import sys
 COMMANDS = ("train", "enjoy", "plot_train", "plot_from_file", "all_plots")
 
 
+USAGE = f"""usage: sb3-chac {{{",".join(COMMANDS)}}} ...
+
+RL-Zoo3's commands with the algorithms of sb3_chac: 'sb3-chac train --help' lists the arguments."""
+
+
 def main() -> None:
-    command = sys.argv[1] if len(sys.argv) > 1 else None
+    command = sys.argv[1] if len(sys.argv) > 1 else "nothing"
     if command in ("-h", "--help"):
-        print(f"usage: sb3-chac {{{','.join(COMMANDS)}}} ...\n\nRL-Zoo3's commands, see 'sb3-chac train --help'.")
+        print(USAGE)
         return
     if command not in COMMANDS:
-        sys.exit(f"sb3-chac: unknown command {command!r}, choose from {', '.join(COMMANDS)}")
+        sys.exit(f"{USAGE}\n\nsb3-chac: {command!r} is not a command, choose from {', '.join(COMMANDS)}.")
 
     from rl_zoo3.cli import main as zoo_main
 

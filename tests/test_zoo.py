@@ -80,8 +80,10 @@ def test_without_autoload_only_our_launcher_knows_dsac(tmp_path):
 
 
 def test_launcher_names_its_commands(tmp_path):
-    assert "choose from train, enjoy" in run([sys.executable, "-m", "sb3_chac", "fly"], tmp_path, fails=True)
-    assert "usage: sb3-chac {train," in run([sys.executable, "-m", "sb3_chac", "--help"], tmp_path)
+    launcher = [sys.executable, "-m", "sb3_chac"]
+    assert "'fly' is not a command, choose from train, enjoy" in run([*launcher, "fly"], tmp_path, fails=True)
+    assert "usage: sb3-chac {train," in run(launcher, tmp_path, fails=True)
+    assert "usage: sb3-chac {train," in run([*launcher, "--help"], tmp_path)
 
 
 @pytest.mark.parametrize(
