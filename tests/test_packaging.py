@@ -1,6 +1,5 @@
 """What a user installs: wheel, sdist and editable installs, each proved in a virtual environment that has nothing else."""
 
-import os
 import shutil
 import subprocess
 import sys
@@ -9,18 +8,11 @@ import zipfile
 from pathlib import Path
 
 import pytest
+from shell import run
 
 ROOT = Path(__file__).parent.parent
 TRAIN = ["train", "--env", "Pendulum-v1", "-n", "250", "--eval-freq", "-1", "-f", "logs"]
 SMALL = ["-params", "learning_starts:100", "policy_kwargs:dict(net_arch=[8])"]
-
-
-def run(*command: str | Path, cwd: Path, fails: bool = False) -> str:
-    env = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "VIRTUAL_ENV")}
-    completed = subprocess.run([str(part) for part in command], cwd=cwd, env=env, capture_output=True, text=True)
-    output = completed.stdout + completed.stderr
-    assert (completed.returncode != 0) == fails, output
-    return output
 
 
 @pytest.fixture(scope="module")

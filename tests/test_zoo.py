@@ -1,27 +1,19 @@
 """RL-Zoo3's own commands with our algorithms, as a user types them. The package under test is the installed one."""
 
-import os
-import subprocess
 import sys
 import sysconfig
 from pathlib import Path
 
 import pytest
 import yaml
+from shell import run
 
 from sb3_chac.zoo import hyperparams_file
 from sb3_chac.zoo.registration import ALGORITHMS
 
-ZOO = [str(Path(sysconfig.get_path("scripts")) / "rl_zoo3")]
+ZOO = Path(sysconfig.get_path("scripts")) / "rl_zoo3"
 QUICK = ["--env", "Pendulum-v1", "-n", "300", "--eval-freq", "150", "--eval-episodes", "1", "-f", "logs", "--seed", "1"]
 SMALL = ["-params", "learning_starts:100", "policy_kwargs:dict(net_arch=[8])"]
-
-
-def run(command: list[str], folder: Path, env: dict[str, str] | None = None, fails: bool = False) -> str:
-    completed = subprocess.run(command, cwd=folder, env={**os.environ, **(env or {})}, capture_output=True, text=True)
-    output = completed.stdout + completed.stderr
-    assert (completed.returncode != 0) == fails, output
-    return output
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +21,7 @@ def trained(tmp_path_factory) -> Path:
     """A folder in which ``rl_zoo3 train --algo dsac`` ran, with checkpoints and the replay buffer."""
     folder = tmp_path_factory.mktemp("zoo")
     extra = ["--save-freq", "200", "--save-replay-buffer", "--vec-env", "subproc", "--progress"]
-    output = run([*ZOO, "train", "--algo", "dsac", *QUICK, *extra, *SMALL], folder)
+    output = run(ZOO, "train", "--algo", "dsac", *QUICK, *extra, *SMALL, cwd=folder)
     assert str(hyperparams_file("dsac")) in output
     return folder
 
@@ -43,13 +35,13 @@ def test_train_leaves_what_the_zoo_promises(trained):
 
 
 def test_enjoy(trained):
-    output = run([*ZOO, "enjoy", "--algo", "dsac", "--env", "Pendulum-v1", "-f", "logs", "--no-render", "-n", "400"], trained)
+    output = run(ZOO, "enjoy", "--algo", "dsac", "--env", "Pendulum-v1", "-f", "logs", "--no-render", "-n", "400", cwd=trained)
     assert "Mean reward:" in output and "2 Episodes" in output
 
 
 def test_continue_training_with_the_replay_buffer(trained):
     model = "logs/dsac/Pendulum-v1_1/Pendulum-v1.zip"
-    output = run([*ZOO, "train", "--algo", "dsac", *QUICK, "-i", model, *SMALL], trained)
+    output = run(ZOO, "train", "--algo", "dsac", *QUICK, "-i", model, *SMALL, cwd=trained)
     assert "Loading pretrained agent" in output and "Loading replay buffer" in output
     assert (trained / "logs" / "dsac" / "Pendulum-v1_2" / "Pendulum-v1.zip").is_file()
 
@@ -57,10 +49,10 @@ def test_continue_training_with_the_replay_buffer(trained):
 def test_optimize_and_train_the_best_trial(tmp_path):
     study = ["--storage", "study.log", "--study-name", "dsac"]
     search = ["-optimize", "--n-trials", "2", "--n-startup-trials", "1", "--n-evaluations", "1", "--no-optim-plots"]
-    output = run([*ZOO, "train", "--algo", "dsac", *QUICK, *search, *study, "-params", "learning_starts:100"], tmp_path)
+    output = run(ZOO, "train", "--algo", "dsac", *QUICK, *search, *study, "-params", "learning_starts:100", cwd=tmp_path)
     assert "Number of finished trials:  2" in output and "Best trial:" in output
     assert "pruned" not in output.lower().replace("pruner", "")  # RL-Zoo3 turns errors into pruned trials
-    output = run([*ZOO, "train", "--algo", "dsac", *QUICK, *study, "--trial-id", "1"], tmp_path)
+    output = run(ZOO, "train", "--algo", "dsac", *QUICK, *study, "--trial-id", "1", cwd=tmp_path)
     assert "Loading from Optuna study..." in output
     saved = yaml.unsafe_load(next(tmp_path.glob("logs/dsac/Pendulum-v1_*/Pendulum-v1/config.yml")).read_text())
     assert 0.97 <= saved["gamma"] < 1 and saved["policy_delay"] in (1, 2, 3) and saved["policy_kwargs"]["net_arch"]
@@ -69,21 +61,21 @@ def test_optimize_and_train_the_best_trial(tmp_path):
 @pytest.mark.parametrize("module", ["rl_zoo3.train", "sb3_chac"])
 def test_other_ways_to_start(tmp_path, module):
     command = [sys.executable, "-m", module, *(["train"] if module == "sb3_chac" else [])]
-    run([*command, "--algo", "dsac", *QUICK, *SMALL], tmp_path)
+    run(*command, "--algo", "dsac", *QUICK, *SMALL, cwd=tmp_path)
     assert (tmp_path / "logs" / "dsac" / "Pendulum-v1_1" / "Pendulum-v1.zip").is_file()
 
 
 def test_without_autoload_only_our_launcher_knows_dsac(tmp_path):
     env = {"SB3_CHAC_NO_AUTOLOAD": "1"}
-    assert "invalid choice: 'dsac'" in run([*ZOO, "train", "--algo", "dsac"], tmp_path, env, fails=True)
-    run([sys.executable, "-m", "sb3_chac", "train", "--algo", "dsac", *QUICK, *SMALL], tmp_path, env)
+    assert "invalid choice: 'dsac'" in run(ZOO, "train", "--algo", "dsac", cwd=tmp_path, env=env, fails=True)
+    run(sys.executable, "-m", "sb3_chac", "train", "--algo", "dsac", *QUICK, *SMALL, cwd=tmp_path, env=env)
 
 
 def test_launcher_names_its_commands(tmp_path):
     launcher = [sys.executable, "-m", "sb3_chac"]
-    assert "'fly' is not a command, choose from train, enjoy" in run([*launcher, "fly"], tmp_path, fails=True)
-    assert "usage: sb3-chac {train," in run(launcher, tmp_path, fails=True)
-    assert "usage: sb3-chac {train," in run([*launcher, "--help"], tmp_path)
+    assert "'fly' is not a command, choose from train, enjoy" in run(*launcher, "fly", cwd=tmp_path, fails=True)
+    assert "usage: sb3-chac {train," in run(*launcher, cwd=tmp_path, fails=True)
+    assert "usage: sb3-chac {train," in run(*launcher, "--help", cwd=tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -94,12 +86,12 @@ def test_launcher_names_its_commands(tmp_path):
     ],
 )
 def test_bad_hyperparameters(tmp_path, params, message):
-    assert message in run([*ZOO, "train", "--algo", "dsac", *QUICK, "-params", params], tmp_path, fails=True)
+    assert message in run(ZOO, "train", "--algo", "dsac", *QUICK, "-params", params, cwd=tmp_path, fails=True)
 
 
 def test_a_conf_file_of_ones_own_has_priority(tmp_path):
     (tmp_path / "own.yml").write_text("Pendulum-v1:\n  n_timesteps: 150\n  policy: MlpPolicy\n  learning_rate: 0.002\n")
-    output = run([*ZOO, "train", "--algo", "dsac", "--env", "Pendulum-v1", "-conf", "own.yml", "-f", "logs"], tmp_path)
+    output = run(ZOO, "train", "--algo", "dsac", "--env", "Pendulum-v1", "-conf", "own.yml", "-f", "logs", cwd=tmp_path)
     assert "Loading hyperparameters from: own.yml" in output
 
 
@@ -107,7 +99,7 @@ def test_importing_the_package_is_cheap():
     code = (
         "import sys, sb3_chac; assert not {'torch', 'numpy', 'gymnasium', 'rl_zoo3'} & set(sys.modules); print(dir(sb3_chac))"
     )
-    output = run([sys.executable, "-c", code], Path.cwd())
+    output = run(sys.executable, "-c", code, cwd=Path.cwd())
     assert "DSAC" in output
 
 
@@ -126,7 +118,7 @@ def test_a_broken_installation_of_ours_only_warns(tmp_path, broken):
     module = {"registration": "sb3_chac.zoo.registration", "exports": "sb3_chac.dsac"}[broken]
     code = f"import sys; sys.modules['{module}'] = None; sys.argv[1:1] = []; from rl_zoo3.train import train; train()"
     quick = [*QUICK, "-params", "learning_starts:100", "policy_kwargs:dict(net_arch=[8])"]
-    output = run([sys.executable, "-c", code, "--algo", "sac", *quick], tmp_path)
+    output = run(sys.executable, "-c", code, "--algo", "sac", *quick, cwd=tmp_path)
     assert "sb3_chac is not registered with rl_zoo3" in output
 
 
