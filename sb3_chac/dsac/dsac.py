@@ -197,7 +197,7 @@ class DSAC(CheckedOffPolicyAlgorithm):
             self.log_ent_coef.fill_(self._initial_ent_coef()).log_()
         self.log_ent_coef.requires_grad_(learn_ent_coef)
         if learn_ent_coef:
-            self.ent_coef_optimizer = th.optim.Adam([self.log_ent_coef], lr=self.ent_coef_lr_schedule(1.0))
+            self.ent_coef_optimizer = th.optim.Adam([self.log_ent_coef], lr=self.ent_coef_lr_schedule(1.0), fused=True)
 
     def _create_aliases(self) -> None:
         self.actor = self.policy.actor
