@@ -150,7 +150,7 @@ def report(args: argparse.Namespace) -> None:
             axis.fill_between(steps, curves.min(axis=0), curves.max(axis=0), color=line.get_color(), alpha=0.15)
         axis.set(title=env_id, xlabel="environment steps", ylabel="evaluation return")
         if axis.lines:
-            axis.legend(loc="lower right")
+            axis.legend()
     figure.tight_layout()
     figure.savefig(args.folder / "curves.png", dpi=90)
 
