@@ -1,0 +1,21 @@
+from sb3_chac.human.experts import Expert, FunctionExpert, ModelExpert, check_expert, make_expert
+from sb3_chac.human.intervention import ControlState, ExpertError, InterventionWrapper
+from sb3_chac.human.rules import DisagreementRule, RiskRule, TakeoverRule, always, check_rule, make_rule, never
+
+__all__ = [
+    "ControlState",
+    "DisagreementRule",
+    "Expert",
+    "ExpertError",
+    "FunctionExpert",
+    "InterventionWrapper",
+    "ModelExpert",
+    "RiskRule",
+    "TakeoverRule",
+    "always",
+    "check_expert",
+    "check_rule",
+    "make_expert",
+    "make_rule",
+    "never",
+]

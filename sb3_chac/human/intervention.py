@@ -1,0 +1,333 @@
+from enum import StrEnum
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from gymnasium.error import ResetNeeded
+from gymnasium.utils import RecordConstructorArgs
+
+from sb3_chac.common.checks import check_action_space, check_integer
+from sb3_chac.human.experts import Expert, check_expert, expert_name, make_expert
+from sb3_chac.human.rules import TakeoverRule, check_rule, make_rule, scale_action
+
+
+class ExpertError(RuntimeError):
+    """Raised when the expert fails or hands in something that is no action. The environment has not made the step."""
+
+
+class ControlState(StrEnum):
+    """Who has control. An environment that is not armed stays AUTONOMOUS."""
+
+    AUTONOMOUS = "autonomous"  # the novice drives and the human watches
+    TAKEOVER = "takeover"  # the human drives
+    PAUSED = "paused"  # the novice drives and the human is not asked
+
+
+# (state, event) -> next state. Events that are not listed for a state leave it as it is.
+TRANSITIONS = {
+    (ControlState.AUTONOMOUS, "take over"): ControlState.TAKEOVER,  # by the rule
+    (ControlState.TAKEOVER, "hand back"): ControlState.AUTONOMOUS,  # by the rule, the end of the episode, an error, disarm()
+    (ControlState.AUTONOMOUS, "pause"): ControlState.PAUSED,  # by pause() or when the budget is spent
+    (ControlState.TAKEOVER, "pause"): ControlState.PAUSED,  # likewise, it ends the takeover
+    (ControlState.PAUSED, "resume"): ControlState.AUTONOMOUS,  # by resume() or disarm()
+}
+
+
+class InterventionWrapper(gym.Wrapper, RecordConstructorArgs):
+    """
+    A stand-in for the human who watches the novice (the agent), takes over and hands back.
+
+    It is inert until armed: actions pass through, the expert is neither built nor called, so that evaluation and loaded models
+    are never driven by it. Algorithms arm their training environments with ``vec_env.env_method("arm")``, and disarm them.
+    When armed, the expert acts on the observation before each step, the rule decides, and either action is executed. The
+    ``info`` of each step, armed or not, says what happened:
+
+    ==================  ==========  ==============================================================================
+    takeover            bool        the human drove this step
+    takeover_start      bool        it is the first step of a takeover
+    applied_action      np.ndarray  what was executed, a copy, in the units and dtype of the action space
+    takeover_cost       float       on the first step of a takeover 1 - cos(novice action, expert action), both
+                                    scaled to [-1, 1]: 0 (same direction) to 2 (opposite); 0 if either is zero
+    cost                float       the environment's, 0 if it has none
+    intervene_action    np.ndarray  the expert's action, on takeover steps only (HIL-SERL's key)
+    is_intervention     bool        as ``takeover`` (the key of gym-hil and LeRobot)
+    human_steps         int         steps that the human drove so far
+    total_steps         int         steps made while armed so far
+    takeover_rate       float       human_steps / total_steps
+    ==================  ==========  ==============================================================================
+
+    An error of the expert, the rule or the environment ends the episode: the next ``step`` needs a ``reset``. The expert is
+    seeded by ``reset(seed=...)``, also when it is armed later. An expert or rule object that remembers must not be shared by
+    several environments (a ``RiskRule`` may).
+
+    :param env: an environment with a bounded Box action space
+    :param expert: who drives during a takeover: the name of a scripted driver of ``env``, a model, an ``Expert`` or a function
+        observation -> action, see ``make_expert``
+    :param rule: when: "risk", "disagreement", "always", "never", a ``TakeoverRule`` or a function, see ``make_rule``
+    :param budget: how many steps the human drives at most (of this environment, over all episodes), None for no limit
+    :param armed: whether to arm it at once
+    :raises ValueError: for an argument that does not fit; while armed, for an action that is not finite or of another shape
+    :raises ExpertError: from ``reset``, ``step`` and ``arm`` when the expert fails
+    """
+
+    def __init__(
+        self,
+        env: gym.Env,
+        expert: Any = "scripted",
+        rule: Any = "risk",
+        budget: int | None = None,
+        armed: bool = False,
+    ):
+        # Not copied: a model may hold a replay buffer or subprocesses
+        RecordConstructorArgs.__init__(self, _disable_deepcopy=True, expert=expert, rule=rule, budget=budget, armed=armed)
+        gym.Wrapper.__init__(self, env)
+        check_action_space(env.action_space)
+        self._box: spaces.Box = env.action_space  # type: ignore[assignment]
+        check_expert(expert, env)
+        check_rule(rule, expert)
+        if budget is not None:
+            check_integer("budget", budget, low=0)
+        self.budget = budget
+        self._expert_argument, self._rule_argument = expert, rule
+        self._expert: Expert | None = None  # both are built when first armed
+        self._rule: TakeoverRule | None = None
+        self._armed = False
+        self._state = ControlState.AUTONOMOUS
+        self._human_steps = 0
+        self._total_steps = 0
+        self._stage: str | int = ""
+        self._observation: Any = None  # None unless an episode is under way
+        self._seed: int | None = None  # the last one that the expert has not had yet
+        if armed:
+            self.arm()
+
+    @property
+    def armed(self) -> bool:
+        return self._armed
+
+    @property
+    def state(self) -> ControlState:
+        return self._state
+
+    @property
+    def human_steps(self) -> int:
+        return self._human_steps
+
+    @property
+    def total_steps(self) -> int:
+        return self._total_steps
+
+    @property
+    def takeover_rate(self) -> float:
+        return self._human_steps / self._total_steps if self._total_steps else 0.0
+
+    def arm(self) -> None:
+        """
+        From the next step on the human watches, also in the middle of an episode. Does nothing if armed already.
+
+        :raises ValueError: if the environment does not know the expert, or "risk" is the rule and the expert predicts nothing
+        """
+        if self._armed:
+            return
+        if self._expert is None or self._rule is None:
+            expert = make_expert(self._expert_argument, self.env)
+            self._rule = make_rule(self._rule_argument, self.env, expert)
+            self._expert = expert
+        if self._budget_is_spent():
+            self._on("pause")
+        else:
+            self._start()
+        self._armed = True
+
+    def disarm(self) -> None:
+        """Ends a takeover and a pause; from the next step on the wrapper is inert. The counts are kept."""
+        self._on("hand back")
+        self._on("resume")
+        self._armed = False
+
+    def pause(self) -> None:
+        """
+        The human is no longer asked, which ends a takeover; steps go on counting.
+
+        :raises RuntimeError: if the wrapper is not armed
+        """
+        self._check_armed("pause")
+        self._on("pause")
+
+    def resume(self) -> None:
+        """
+        The human is asked again, unless the budget is spent.
+
+        :raises RuntimeError: if the wrapper is not armed
+        """
+        self._check_armed("resume")
+        if self._state is ControlState.PAUSED and not self._budget_is_spent():
+            self._on("resume")
+            self._start()
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        self._observation = None
+        self._on("hand back")
+        observation, info = self.env.reset(seed=seed, options=options)
+        self._observation = observation
+        if seed is not None:
+            self._seed = seed
+        if self._armed and self._state is not ControlState.PAUSED:
+            self._start()
+        return observation, info
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        novice_action = self._checked_novice_action(action) if self._armed else np.array(action, self._box.dtype)
+        # If anything below fails it stays so: the human does not drive, and only reset() goes on
+        observation, self._observation = self._observation, None
+        was_driving = self._state is ControlState.TAKEOVER
+        self._on("hand back")
+
+        takeover, executed, applied_action, takeover_cost = False, action, novice_action, 0.0
+        if self._armed and self._state is not ControlState.PAUSED:
+            expert_action = self._ask_expert(observation)
+            takeover = self._ask_rule(observation, novice_action, expert_action, was_driving)
+            if takeover:
+                executed, applied_action = expert_action.copy(), expert_action
+            if takeover and not was_driving:
+                takeover_cost = self._cosine_distance(novice_action, expert_action)
+        observation, reward, terminated, truncated, info = self.env.step(executed)
+
+        self._total_steps += self._armed
+        self._human_steps += takeover
+        if not (terminated or truncated):
+            self._observation = observation
+            self._on("take over" if takeover else "hand back")
+        if self._armed and self._budget_is_spent():
+            self._on("pause")
+        info = {
+            "cost": 0.0,
+            **info,
+            "takeover": takeover,
+            "takeover_start": takeover and not was_driving,
+            "applied_action": applied_action,
+            "takeover_cost": takeover_cost,
+            "is_intervention": takeover,
+            "human_steps": self._human_steps,
+            "total_steps": self._total_steps,
+            "takeover_rate": self.takeover_rate,
+        }
+        if takeover:
+            info["intervene_action"] = applied_action.copy()
+        return observation, reward, terminated, truncated, info
+
+    def set_stage(self, stage: str | int) -> None:
+        """
+        :param stage: stage of the training, for the display
+        """
+        self._stage = stage
+
+    @property
+    def hud(self) -> dict[str, Any]:
+        """What an environment with an attribute ``hud`` may display."""
+        return {
+            "takeover": self._state is ControlState.TAKEOVER,
+            "steps": self._total_steps,
+            "takeover rate": self.takeover_rate,
+            "stage": self._stage,
+        }
+
+    def render(self) -> Any:
+        if hasattr(self.unwrapped, "hud"):
+            self.unwrapped.hud = self.hud
+        return self.env.render()
+
+    def state_dict(self) -> dict[str, int]:
+        """
+        :return: the counts, to go on with the same budget after a restart
+        """
+        return {"human_steps": self._human_steps, "total_steps": self._total_steps}
+
+    def load_state_dict(self, state_dict: dict[str, int]) -> None:
+        """
+        :param state_dict: from ``state_dict``
+        :raises ValueError: unless it holds the two counts
+        """
+        human_steps, total_steps = state_dict.get("human_steps"), state_dict.get("total_steps")
+        check_integer("human_steps in state_dict", human_steps, low=0)
+        check_integer("total_steps in state_dict", total_steps, low=int(human_steps))  # type: ignore[arg-type]
+        self._human_steps, self._total_steps = int(human_steps), int(total_steps)  # type: ignore[arg-type]
+        if self._armed and self._budget_is_spent():
+            self._on("pause")
+
+    def _on(self, event: str) -> None:
+        self._state = TRANSITIONS.get((self._state, event), self._state)
+
+    def _budget_is_spent(self) -> bool:
+        return self.budget is not None and self._human_steps >= self.budget
+
+    def _check_armed(self, name: str) -> None:
+        if not self._armed:
+            raise RuntimeError(f"{name}() needs an armed InterventionWrapper: call arm() first.")
+
+    def _start(self) -> None:
+        """Tells expert and rule that they are asked from now on; before the first reset() there is nothing to look at yet."""
+        if self._observation is None:
+            return
+        assert self._expert is not None and self._rule is not None
+        observation, self._observation = self._observation, None  # stays None if anything fails
+        try:
+            self._expert.reset(seed=self._seed)
+        except Exception as error:
+            raise self._expert_error(f"raised {type(error).__name__} in its reset: {error}.") from error
+        self._rule.reset()
+        self._observation, self._seed = observation, None
+
+    def _ask_expert(self, observation: Any) -> np.ndarray:
+        """
+        :return: the expert's action, within the bounds and of the dtype of the action space
+        """
+        assert self._expert is not None
+        try:
+            values = np.array(self._expert(observation), dtype=np.float64)
+        except Exception as error:
+            raise self._expert_error(f"raised {type(error).__name__}: {error}.") from error
+        low, high = self._box.low.astype(np.float64), self._box.high.astype(np.float64)
+        if values.shape != self._box.shape:
+            raise self._expert_error(f"returned shape {values.shape}, the action space has {self._box.shape}.")
+        if not np.isfinite(values).all():
+            raise self._expert_error(f"returned an action that is NaN or infinite: {values}.")
+        tolerance = 1e-6 * (high - low) / 2  # for rounding
+        if np.any((values < low - tolerance) | (values > high + tolerance)):
+            raise self._expert_error(f"returned an action out of bounds: {values} is not within {low} and {high}.")
+        values = np.clip(values, low, high)
+        is_integer = np.issubdtype(self._box.dtype, np.integer)
+        return (np.rint(values) if is_integer else values).astype(self._box.dtype)
+
+    def _expert_error(self, problem: str) -> ExpertError:
+        return ExpertError(
+            f"The {expert_name(self._expert_argument)} {problem} The environment did not make a step. Mend the expert or pass "
+            "another as expert=..., and go on with reset()."
+        )
+
+    def _ask_rule(self, observation: Any, novice_action: np.ndarray, expert_action: np.ndarray, was_driving: bool) -> bool:
+        assert self._rule is not None
+        takeover = self._rule(observation, novice_action, expert_action, was_driving)
+        if not isinstance(takeover, bool | np.bool_):
+            raise TypeError(f"rule must return True or False, got {takeover!r} from {self._rule_argument!r}.")
+        return bool(takeover)
+
+    def _checked_novice_action(self, action: Any) -> np.ndarray:
+        if self._observation is None:
+            raise ResetNeeded("Call reset() before step(): no episode is under way (none started, it ended, or it failed).")
+        try:
+            array = np.array(action, dtype=np.float64)
+        except (TypeError, ValueError):
+            array = np.array(np.nan)
+        if not np.isfinite(array).all() or array.shape != self._box.shape:
+            raise ValueError(
+                f"action must be finite numbers of shape {self._box.shape}, got {action!r}. The environment did not "
+                "make a step: look for the NaN or the shape where the action comes from."
+            )
+        return array.astype(self._box.dtype)
+
+    def _cosine_distance(self, novice_action: np.ndarray, expert_action: np.ndarray) -> float:
+        novice, expert = (scale_action(action, self._box).ravel() for action in (novice_action, expert_action))
+        norms = np.linalg.norm(novice) * np.linalg.norm(expert)
+        return float(np.clip(1 - novice @ expert / norms, 0, 2)) if norms > 0 else 0.0

@@ -1,0 +1,303 @@
+"""Which expert drives and when: rules step by step, models, and what happens to bad ones."""
+
+import functools
+import math
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+from gymnasium.error import ResetNeeded
+from stable_baselines3 import SAC
+from takeover_toys import (
+    EXPERT,
+    NOVICE,
+    DictIntegrator,
+    DrivenIntegrator,
+    Integrator,
+    NoisyDriver,
+    Script,
+    armed,
+    bits,
+    constant,
+    drive,
+)
+
+from sb3_chac.human import (
+    ControlState,
+    DisagreementRule,
+    ExpertError,
+    InterventionWrapper,
+    ModelExpert,
+    RiskRule,
+    make_expert,
+    make_rule,
+)
+
+# Rules
+
+
+def test_a_function_as_rule():
+    def far_apart(observation, novice_action, expert_action):
+        return novice_action[0] - expert_action[0] > 0.9
+
+    env = armed(far_apart)
+    assert [env.step(np.array([x, 0.0]))[4]["takeover"] for x in (0.3, 0.5, -1.0)] == [False, True, False]
+
+
+def test_disagreement_is_in_scaled_units():
+    space = spaces.Box(np.array([0.0, -10.0]), np.array([1.0, 10.0]), dtype=np.float64)
+    rule = DisagreementRule(0.25, space)
+    expert = np.array([0.5, 0.0])
+    # scaled by half the range, the differences are 2 x and y / 10; their root mean square is divided by sqrt(2)
+    just_below, just_above = 0.25 * math.sqrt(2) * 0.999, 0.25 * math.sqrt(2) * 1.001
+    for difference, drives in [(just_below, False), (just_above, True)]:
+        assert rule(None, expert + np.array([difference / 2, 0]), expert, False) is drives
+        assert rule(None, expert + np.array([0, -10 * difference]), expert, True) is drives
+
+
+def test_disagreement_by_name():
+    env = armed("disagreement")
+    near, far = EXPERT + 0.1, EXPERT + 0.5
+    assert [env.step(action)[4]["takeover"] for action in (near, far, near)] == [False, True, False]
+
+
+def risky(times, **kwargs):
+    times = iter(times)
+    return RiskRule(lambda observation, action: next(times), **kwargs)
+
+
+@pytest.mark.parametrize(
+    "times, kwargs, expected",
+    [
+        ("LLLLLLLL", dict(delay=3, hold=10), "00011111"),  # the human reacts after three steps of trouble
+        ("LLLHLLLL", dict(delay=3, hold=10), "00000001"),  # they are consecutive
+        ("LLLMLLLL", dict(delay=3, hold=10), "00000001"),  # between the thresholds is no trouble
+        ("LH", dict(delay=0), "11"),
+        ("LHHHHHHH", dict(delay=0, hold=4, safe=2), "11110000"),  # held for 4 steps although safe after 2
+        ("LMHMHHHH", dict(delay=0, hold=1, safe=2), "11111000"),  # safe steps are consecutive, M is not safe
+        ("LHHHHHHH", dict(delay=0, hold=1, safe=1), "10000000"),
+        ("LLHHLLLL", dict(delay=1, hold=1, safe=2), "01100111"),  # after a takeover, the delay counts anew
+        ("LHHLHHH", dict(delay=0, hold=2, safe=1), "1101100"),  # and so do the held steps
+        ("LHHLHHH", dict(delay=0, hold=1, safe=2), "1101100"),  # and the safe ones
+        ("LLLLLHHHHHHHHHHH", dict(), "0001111111111000"),  # the defaults: steps 3 to 12 are held
+    ],
+)
+def test_risk_rule_steps(times, kwargs, expected):
+    seconds = {"L": 1.0, "M": 1.5, "H": math.inf}
+    assert drive(armed(risky([seconds[time] for time in times], **kwargs)), len(times)) == bits(expected)
+
+
+def test_risk_rule_smooths_the_action():
+    seen = []
+    rule = RiskRule(lambda observation, action: seen.append(float(action[0])) or math.inf, smoothing=0.75)
+    env = armed(rule)
+    for x in (0.0, 1.0, 1.0):
+        env.step(np.array([x, 0.0]))
+    env.reset()
+    env.step(np.array([1.0, 0.0]))
+    assert seen == [0.0, 0.25, 0.4375, 1.0]
+
+
+def test_risk_by_name_uses_the_experts_predictor():
+    env = armed("risk", "scripted", DrivenIntegrator())
+    assert drive(env, 5) == bits("00011")  # the novice's x is positive
+    with pytest.raises(ValueError, match=r"time_to_trouble.*RiskRule\(time_to_trouble=\.\.\.\)"):
+        armed("risk", "scripted-ideal", DrivenIntegrator())
+
+
+def test_environments_do_not_share_a_risk_rule():
+    rule = RiskRule(lambda observation, action: 0.0, delay=1)
+    first, second = armed(rule), armed(rule)
+    assert [drive(first, 1), drive(second, 1), drive(first, 1), drive(second, 1)] == [[False], [False], [True], [True]]
+
+
+def test_make_rule_keeps_rule_objects():
+    script = Script([])
+    assert make_rule(script, Integrator(), constant) is script
+
+
+def test_a_rule_that_raises():
+    decisions = iter([True, None, True])
+
+    def rule(observation, novice_action, expert_action):
+        decision = next(decisions)
+        if decision is None:
+            raise ZeroDivisionError
+        return decision
+
+    env = armed(rule)
+    drive(env, 1)
+    with pytest.raises(ZeroDivisionError):
+        env.step(NOVICE)
+    assert len(env.unwrapped.executed) == 1 and env.state is ControlState.AUTONOMOUS and env.total_steps == 1
+    with pytest.raises(ResetNeeded):
+        env.step(NOVICE)
+    env.reset()
+    assert drive(env, 1, "takeover_start") == [True]
+
+
+def test_rules_must_answer_true_or_false():
+    with pytest.raises(TypeError, match="rule must return True or False, got None"):
+        drive(armed(lambda *args: None), 1)
+    with pytest.raises(ValueError, match="NaN"):
+        drive(armed(risky([math.nan])), 1)
+
+
+# Experts
+
+
+@pytest.mark.parametrize("env_class, policy", [(Integrator, "MlpPolicy"), (DictIntegrator, "MultiInputPolicy")])
+def test_a_model_as_expert(env_class, policy):
+    model = SAC(policy, env_class(), policy_kwargs=dict(net_arch=[8]), buffer_size=10, seed=0)
+    env = armed("always", model, env_class())
+    observation, _ = env.reset(seed=1)
+    info = env.step(NOVICE)[4]
+    np.testing.assert_array_equal(info["applied_action"], model.predict(observation, deterministic=True)[0])
+    with pytest.raises(ValueError, match=r"observation space of the SAC model is .* trained on this environment"):
+        InterventionWrapper(OtherShape(), model, "always")
+    with pytest.raises(ValueError, match="SAC model is"):
+        InterventionWrapper(gym.make("Pendulum-v1"), model, "always")
+
+
+def test_recurrent_models_keep_their_state():
+    class Counter:
+        def predict(self, observation, state=None, episode_start=None, deterministic=False):
+            count = 0 if state is None or episode_start[0] else state[0] + 1
+            return np.array([count / 10, 0.0]), (count,)
+
+    expert = make_expert(Counter(), Integrator())
+    assert isinstance(expert, ModelExpert)
+    assert [expert(None)[0] for _ in range(3)] == [0.0, 0.1, 0.2]
+    expert.reset()
+    assert expert(None)[0] == 0.0
+
+
+def test_models_of_images():
+    class Images(Integrator):
+        observation_space = spaces.Box(0, 255, (36, 36, 3), np.uint8)
+
+        def obs(self):
+            return np.full((36, 36, 3), 7, np.uint8)
+
+    model = SAC("CnnPolicy", Images(), policy_kwargs=dict(net_arch=[8]), buffer_size=10)
+    assert model.observation_space.shape == (3, 36, 36)
+    assert drive(armed("always", model, Images()), 1) == [True]
+
+
+def raises(observation):
+    raise KeyError("lane")
+
+
+@pytest.mark.parametrize(
+    "expert, message",
+    [
+        (raises, "expert raises raised KeyError: 'lane'"),
+        (lambda observation: np.array([np.nan, 0.0]), "NaN or infinite"),
+        (lambda observation: np.array([np.inf, 0.0]), "NaN or infinite"),
+        (lambda observation: np.zeros(3), r"shape \(3,\).* \(2,\)"),
+        (lambda observation: 0.0, r"shape \(\)"),
+        (lambda observation: None, r"shape \(\)"),
+        (lambda observation: np.array([1.00001, 0.0]), "out of bounds"),
+        (lambda observation: np.array([0.0, -3.0]), "out of bounds"),
+    ],
+)
+def test_bad_experts_never_reach_the_environment(expert, message):
+    calls = []
+
+    @functools.wraps(expert)  # the name in the message
+    def sometimes_bad(observation):
+        return expert(observation) if calls else constant(observation)
+
+    env = armed(Script([True] * 9), sometimes_bad)
+    drive(env, 1)
+    calls.append(None)
+    with pytest.raises(ExpertError, match=f"(?s){message}.*Mend the expert") as error:
+        env.step(NOVICE)
+    assert isinstance(error.value.__cause__, KeyError) == (expert is raises)
+    assert len(env.unwrapped.executed) == env.human_steps == env.total_steps == 1
+    assert env.state is ControlState.AUTONOMOUS
+    with pytest.raises(ResetNeeded):
+        env.step(NOVICE)
+    calls.clear()
+    env.reset()
+    assert drive(env, 1, "takeover_start") == [True]
+
+
+def test_an_expert_whose_reset_fails():
+    class Broken(NoisyDriver):
+        def reset(self, seed=None):
+            raise OSError("no map")
+
+    env = InterventionWrapper(Integrator(), Broken(), "always")
+    env.reset()
+    with pytest.raises(ExpertError, match="Broken raised OSError in its reset: no map") as error:
+        env.arm()
+    assert isinstance(error.value.__cause__, OSError)
+    assert not env.armed and drive(env, 1) == [False]
+    env = InterventionWrapper(Integrator(), Broken(), "always", armed=True)
+    with pytest.raises(ExpertError):
+        env.reset()
+    with pytest.raises(ResetNeeded):
+        env.step(NOVICE)
+
+
+def test_rounding_is_clipped():
+    env = armed(expert=lambda observation: np.array([1 + 5e-7, -1 - 5e-7]))
+    assert env.step(NOVICE)[4]["applied_action"].tolist() == [1.0, -1.0]
+
+
+# Arguments
+
+
+class NoActions(Integrator):
+    action_space = spaces.Discrete(2)
+
+
+class OtherShape(Integrator):
+    observation_space = spaces.Box(-1, 1, (3,), np.float32)
+
+
+@pytest.mark.parametrize(
+    "kwargs, message",
+    [
+        (dict(expert="scripted"), "expert: Integrator has no scripted driver.*'scripted'.*function observation -> action"),
+        (dict(expert="model.zip"), r"expert: 'model.zip' is a file.*SAC\.load"),
+        (dict(expert=__file__), "is a file"),
+        (dict(expert=3), "expert must be"),
+        (dict(expert=NoisyDriver), "expert must be"),
+        (dict(rule="often"), "rule must be one of 'risk', 'disagreement', 'always', 'never'.*'often'"),
+        (dict(rule=None), "rule must be"),
+        (dict(rule=RiskRule), "rule must be"),
+        (dict(rule="risk"), "rule: 'risk' needs an expert that predicts"),
+        (dict(budget=-1), "budget must be an integer of at least 0"),
+        (dict(budget=1.5), "budget must be"),
+        (dict(env=NoActions()), "env: the action space must be continuous"),
+    ],
+)
+def test_bad_arguments(kwargs, message):
+    with pytest.raises(ValueError, match=message):
+        InterventionWrapper(**{"env": Integrator(), "expert": constant, "rule": "always", **kwargs})
+
+
+@pytest.mark.parametrize(
+    "name, value",
+    [
+        ("time_to_trouble", 1.0),
+        ("take_over_below", 0.0),
+        ("hand_back_above", 1.0),
+        ("delay", -1),
+        ("hold", 0),
+        ("safe", 0),
+        ("smoothing", 1.0),
+    ],
+)
+def test_bad_arguments_of_risk_rule(name, value):
+    with pytest.raises(ValueError, match=name):
+        RiskRule(**{"time_to_trouble": lambda observation, action: math.inf, name: value})
+
+
+@pytest.mark.parametrize("threshold, space", [(-0.1, Integrator.action_space), (0.1, spaces.Discrete(2))])
+def test_bad_arguments_of_disagreement_rule(threshold, space):
+    with pytest.raises(ValueError, match=r"threshold|action space"):
+        DisagreementRule(threshold, space)
