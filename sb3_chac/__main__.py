@@ -1,16 +1,17 @@
-"""``python -m sb3_chac train ...`` (or ``sb3-chac train ...``): RL-Zoo3's commands with our algorithms registered.
+"""``python -m sb3_chac train ...`` (or ``sb3-chac train ...``): RL-Zoo3's commands with our algorithms registered, and ours.
 
-For places where the stock ``rl_zoo3`` command does not find them (no .pth files, ``SB3_CHAC_NO_AUTOLOAD`` set).
+RL-Zoo3's are for places where the stock ``rl_zoo3`` command does not find them (no .pth files, ``SB3_CHAC_NO_AUTOLOAD`` set).
 """
 
 import sys
 
-COMMANDS = ("train", "enjoy", "plot_train", "plot_from_file", "all_plots")
+COMMANDS = ("train", "enjoy", "plot_train", "plot_from_file", "all_plots", "evaluate")
 
 
 USAGE = f"""usage: sb3-chac {{{",".join(COMMANDS)}}} ...
 
-RL-Zoo3's commands with the algorithms of sb3_chac: 'sb3-chac train --help' lists the arguments."""
+RL-Zoo3's commands with the algorithms of sb3_chac, and 'evaluate' for a model or an expert on held-out scenarios:
+'sb3-chac train --help' lists the arguments."""
 
 
 def main() -> None:
@@ -20,6 +21,11 @@ def main() -> None:
         return
     if command not in COMMANDS:
         sys.exit(f"{USAGE}\n\nsb3-chac: {command!r} is not a command, choose from {', '.join(COMMANDS)}.")
+    if command == "evaluate":
+        from sb3_chac.evaluate import main as evaluate
+
+        evaluate(sys.argv[2:])
+        return
 
     from rl_zoo3.cli import main as zoo_main
 

@@ -1,0 +1,216 @@
+"""One evaluation episode at a time: what acts, in which environment, and the record of it."""
+
+import io
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.envs.registration import EnvSpec
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.utils import FloatSchedule, check_for_correct_spaces
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+import sb3_chac.envs  # noqa: F401  (registers our environments)
+
+# Stored with a model, but of no use for acting (a schedule may not even load in another Python version)
+NOT_FOR_ACTING = {
+    "verbose": 0,
+    "buffer_size": 1,
+    "optimize_memory_usage": False,
+    "learning_rate": 0.0,
+    "lr_schedule": FloatSchedule(0.0),
+    "clip_range": 0.0,
+}
+
+
+class NotEvaluable(ValueError):
+    """Raised if policy, environment and scenarios cannot be evaluated together."""
+
+
+class DrivenPath(NamedTuple):
+    """Where an episode went: ``positions`` [m] of shape (steps + 1, 2), ``costly`` of shape (steps + 1,): cost arose there."""
+
+    positions: np.ndarray
+    costly: np.ndarray
+
+
+def make_env(env: str | EnvSpec | Callable[..., gym.Env], env_kwargs: dict[str, Any]) -> gym.Env:
+    """
+    :raises NotEvaluable: if there is no such environment, or it does not take ``env_kwargs``
+    """
+    try:
+        return gym.make(env, **env_kwargs) if isinstance(env, str | EnvSpec) else env(**env_kwargs)
+    except (gym.error.Error, ImportError) as error:
+        raise NotEvaluable(f"env: {env!r} cannot be made: {error}") from error
+    except (TypeError, ValueError) as error:
+        raise NotEvaluable(f"env: {env!r} cannot be made with env_kwargs {env_kwargs}: {error}") from error
+
+
+class SavedModel(NamedTuple):
+    """A model on its way to another process."""
+
+    algorithm: type[BaseAlgorithm]
+    archive: bytes
+
+    def load(self, env: gym.Env) -> BaseAlgorithm:
+        """
+        :param env: its spaces must be the model's; HER does not load without one
+        :return: the model, on the CPU, fit for acting only
+        """
+        env_of_model = DummyVecEnv([lambda: env])
+        return self.algorithm.load(io.BytesIO(self.archive), env_of_model, device="cpu", custom_objects=NOT_FOR_ACTING)
+
+
+class ModelDriver:
+    """
+    A model in the form of a driver: ``reset(seed)``, then one call per step.
+
+    :raises NotEvaluable: unless the spaces of the model and of the environment agree
+    """
+
+    def __init__(self, model: BaseAlgorithm, env: gym.Env, normalize: VecNormalize | None) -> None:
+        self.model = model
+        self.normalize = normalize
+        try:
+            wrapped = model._wrap_env(DummyVecEnv([lambda: env]), verbose=0, monitor_wrapper=False)  # transposes images
+            check_for_correct_spaces(wrapped, model.observation_space, model.action_space)
+        except ValueError as error:
+            raise NotEvaluable(f"the model does not fit {env.unwrapped}: {error}") from None
+        self.reset()
+
+    def reset(self, seed: int = 0) -> None:
+        self.state: tuple[np.ndarray, ...] | None = None
+        self.episode_start = np.ones(1, dtype=bool)
+
+    def __call__(self, observation: Any) -> Any:
+        if self.normalize is not None:
+            observation = self.normalize.normalize_obs(observation)
+        action, self.state = self.model.predict(observation, self.state, self.episode_start, deterministic=True)
+        self.episode_start = np.zeros(1, dtype=bool)
+        return action[()]  # a discrete action as a number
+
+
+class Task(NamedTuple):
+    """What a process has to know to run episodes, see ``evaluate``."""
+
+    policy: BaseAlgorithm | SavedModel | str | Callable[[Any], Any]
+    env: str | EnvSpec | Callable[..., gym.Env]
+    env_kwargs: dict[str, Any]
+    normalize: VecNormalize | None = None
+    seed: int = 0
+    use_scenarios: bool = True
+    record_paths: bool = False
+
+
+class Runner:
+    """
+    Runs the episodes of a task in this process. A context manager, which closes its environment.
+
+    :param task: what to run
+    :param render_mode: of the environment
+    :raises NotEvaluable: if policy and environment do not fit
+    """
+
+    def __init__(self, task: Task, render_mode: str | None = None) -> None:
+        self.task = task
+        self.env = make_env(task.env, task.env_kwargs | ({"render_mode": render_mode} if render_mode else {}))
+        try:
+            self.driver = self._make_driver()
+        except BaseException:
+            self.env.close()
+            raise
+
+    def __enter__(self) -> "Runner":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.env.close()
+
+    def _make_driver(self) -> Callable[[Any], Any]:
+        policy = self.task.policy
+        if isinstance(policy, SavedModel):
+            policy = policy.load(self.env)
+        if isinstance(policy, BaseAlgorithm):
+            return ModelDriver(policy, self.env, self.task.normalize)
+        if not isinstance(policy, str):
+            return policy
+        if not hasattr(self.env.unwrapped, "scripted_driver"):
+            raise NotEvaluable(f"expert {policy!r}: {self.env.unwrapped} has no scripted drivers.")
+        try:
+            return self.env.unwrapped.scripted_driver(policy)
+        except (ValueError, KeyError) as error:
+            raise NotEvaluable(f"expert {policy!r} is not available in {self.env.unwrapped}: {error}") from error
+
+    def seed(self, number: int) -> int:
+        """
+        :return: seed of one episode, from the task's seed and the number of the episode alone
+        """
+        return int(np.random.SeedSequence([self.task.seed, number]).generate_state(1)[0])
+
+    def reset(self, number: int) -> Any:
+        """
+        :param number: scenario, or episode if the task has no scenarios
+        :return: first observation
+        """
+        options = {"scenario": number} if self.task.use_scenarios else None
+        observation, _ = self.env.reset(seed=self.seed(number), options=options)
+        if hasattr(self.driver, "reset"):
+            self.driver.reset(self.seed(number))
+        return observation
+
+    def episode(self, number: int, on_step: Callable[[], None] = lambda: None) -> tuple[dict[str, Any], DrivenPath | None]:
+        """
+        :param number: scenario, or episode if the task has no scenarios
+        :param on_step: called after the reset and after each step
+        :return: record and driven path, see ``Evaluation``
+        :raises NotEvaluable: if the path is to be recorded, but the environment has no position
+        :raises ValueError: for a reward, cost or route completion that is not finite
+        """
+        observation = self.reset(number)
+        info: dict[str, Any] = {}
+        rewards, costs, positions = [0.0], [0.0], [self._position()]
+        terminated = truncated = False
+        on_step()
+        while not (terminated or truncated):
+            observation, reward, terminated, truncated, info = self.env.step(self.driver(observation))
+            rewards.append(float(reward))
+            costs.append(float(info.get("cost", 0.0)))
+            positions.append(self._position())
+            on_step()
+        record = {
+            "scenario" if self.task.use_scenarios else "episode": number,
+            "seed": self.seed(number),
+            "return": math.fsum(rewards),
+            "steps": len(rewards) - 1,
+            **({"cost": math.fsum(costs)} if "cost" in info else {}),
+            **({"success": bool(info["is_success"])} if "is_success" in info else {}),
+            **({"route_completion": float(info["route_completion"])} if "route_completion" in info else {}),
+            "terminated": bool(terminated),
+            "truncated": bool(truncated),
+        }
+        for key in ("return", "cost", "route_completion"):
+            if not math.isfinite(record.get(key, 0.0)):
+                raise ValueError(f"{key} of episode {number} of {self.env.unwrapped} is {record[key]}: mend the environment.")
+        record |= {key: value for key, value in _scalars(info).items() if key not in {*record, "is_success"}}
+        return record, DrivenPath(np.array(positions), np.array(costs) > 0) if self.task.record_paths else None
+
+    def _position(self) -> np.ndarray | None:
+        if not self.task.record_paths:
+            return None
+        if not hasattr(self.env.unwrapped, "position"):
+            raise NotEvaluable(f"env: {self.env.unwrapped} has no position, its paths cannot be recorded.")
+        return np.array(self.env.unwrapped.position, dtype=float)
+
+
+def _scalars(info: dict[str, Any]) -> dict[str, Any]:
+    """
+    :return: the numbers, truth values and texts in ``info``, as Python's own types, without NaN and infinity
+    """
+    values = {str(key): value.item() if isinstance(value, np.generic) else value for key, value in info.items()}
+    return {
+        key: value
+        for key, value in values.items()
+        if isinstance(value, int | str) or (isinstance(value, float) and math.isfinite(value))
+    }

@@ -1,0 +1,194 @@
+"""Deterministic evaluation episodes: one per scenario, in parallel processes if wanted."""
+
+import importlib.metadata
+import io
+import json
+import multiprocessing
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, field
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch as th
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.common.vec_env.base_vec_env import CloudpickleWrapper
+from tqdm import tqdm
+
+import sb3_chac
+from sb3_chac.common.checks import check_integer
+from sb3_chac.common.episodes import DrivenPath, NotEvaluable, Runner, SavedModel, Task
+
+# Key of a record -> what the table calls it. The second to fourth only exist if the environment reports them.
+METRICS = {
+    "return": "return",
+    "cost": "safety cost",
+    "success": "success rate",
+    "route_completion": "route completion",
+    "steps": "steps",
+}
+
+
+@dataclass
+class Evaluation:
+    """
+    Result of ``evaluate``.
+
+    :param records: one dictionary per episode: scenario (or episode), seed, return, steps, terminated, truncated; success,
+        cost and route_completion if the environment reports them; and every other scalar of its last info
+    :param settings: policy, environment, scenarios, seed and versions, can be written as JSON
+    :param paths: one per episode, if they were asked for
+    """
+
+    records: list[dict[str, Any]]
+    settings: dict[str, Any]
+    paths: list[DrivenPath] = field(default_factory=list)
+
+    def summary(self) -> dict[str, float]:
+        """
+        :return: number of episodes, mean and standard deviation over the episodes of all that every episode reports
+        """
+        result: dict[str, float] = {"episodes": len(self.records)}
+        for key in METRICS:
+            values = [record[key] for record in self.records if key in record]
+            if len(values) == len(self.records):
+                name = "success_rate" if key == "success" else key
+                result[name if key == "success" else f"{name}_mean"] = float(np.mean(values))
+                result[f"{name}_std"] = float(np.std(values))
+        return result
+
+    def table(self) -> str:
+        """
+        :return: the summary to read, a line per number
+        """
+        summary = self.summary()
+        lines = [f"{self.settings['policy']} on {self.settings['env']}, {len(self.records)} episodes, mean ± std"]
+        for key, title in METRICS.items():
+            name = "success_rate" if key == "success" else f"{key}_mean"
+            if name in summary:
+                std = summary[name.removesuffix("_mean") + "_std"]
+                lines.append(f"  {title:<17}{summary[name]:>10.3f} ± {std:.3f}")
+        return "\n".join(lines)
+
+    def to_json(self) -> str:
+        """
+        :return: summary, settings and records as strict JSON (no NaN); what an episode does not have is left out
+        """
+        return json.dumps(
+            {**self.summary(), **self.settings, "records": self.records}, indent=2, allow_nan=False, default=repr
+        )
+
+
+def evaluate(
+    policy: BaseAlgorithm | str | Callable[[Any], Any],
+    env: str | Callable[..., gym.Env] = "SafeDrive-v0",
+    scenarios: Iterable[int] | str = range(1000, 1050),
+    *,
+    episodes: int | None = None,
+    seed: int = 0,
+    jobs: int = 1,
+    env_kwargs: dict[str, Any] | None = None,
+    normalize: VecNormalize | None = None,
+    record_paths: bool = False,
+    progress_bar: bool = False,
+) -> Evaluation:
+    """
+    Run one deterministic episode per scenario. An episode depends on ``seed`` and its scenario only, not on ``jobs``, the
+    order or the other scenarios. The return is the sum of the environment's raw rewards.
+
+    With ``jobs`` above 1 the processes are spawned: a script must call this under ``if __name__ == "__main__":``.
+    They act on the CPU with one torch thread each; with ``jobs=1`` a model acts on its own device.
+
+    :param policy: a model, the name of an expert of the environment (``env.unwrapped.scripted_driver(name)``), or a function
+        of the observation that returns the action; if that has a method ``reset(seed)``, it is called after each env reset
+    :param env: id of the environment, or a function that makes it
+    :param scenarios: numbers that ``env.reset(options={"scenario": k})`` understands, or text such as "1000:1050"
+    :param episodes: for environments without scenarios: number of episodes, ``scenarios`` is ignored then
+    :param seed: non-negative
+    :param jobs: number of processes
+    :param env_kwargs: passed to the environment
+    :param normalize: statistics that the model's observations are normalized with, by default those of the model's own env
+    :param record_paths: whether to keep the driven paths, for environments that have ``env.unwrapped.position``
+    :param progress_bar: whether to show one
+    :return: the records, in the order of the scenarios
+    :raises ValueError: if the arguments do not fit together (``NotEvaluable``), or for a reward, cost or route completion
+        that is not finite
+    """
+    check_integer("seed", seed, low=0)
+    check_integer("jobs", jobs, low=1)
+    if episodes is not None:
+        check_integer("episodes", episodes, low=1)
+    numbers = scenario_list(scenarios) if episodes is None else list(range(episodes))
+    if normalize is None and isinstance(policy, BaseAlgorithm):
+        normalize = policy.get_vec_normalize_env()
+    task = Task(policy, env, env_kwargs or {}, normalize, seed, episodes is None, record_paths)
+    with Runner(task) as runner:  # finds what does not fit, before any process is started
+        results = list(tqdm(_episodes(runner, numbers, jobs), total=len(numbers), disable=not progress_bar, unit="episode"))
+    settings = {
+        "policy": policy if isinstance(policy, str) else getattr(policy, "__name__", type(policy).__name__),
+        "env": env if isinstance(env, str) else getattr(env, "__name__", repr(env)),
+        "env_kwargs": env_kwargs or {},
+        "normalized": normalize is not None,
+        "scenarios": numbers if episodes is None else None,
+        "seed": seed,
+        "versions": {
+            "sb3_chac": sb3_chac.__version__,
+            **{name: importlib.metadata.version(name) for name in ("stable_baselines3", "torch", "gymnasium")},
+        },
+    }
+    records, paths = zip(*results, strict=True)
+    return Evaluation(list(records), settings, list(paths) if record_paths else [])
+
+
+def scenario_list(scenarios: Iterable[int] | str) -> list[int]:
+    """
+    :param scenarios: numbers, or text: "1000:1050" (1050 itself excluded), "1000" or "1000,1003:1010"
+    :raises ValueError: if there is none, one is negative or occurs twice, or the text is malformed
+    """
+    if isinstance(scenarios, str):
+        parts = [part.strip().split(":") for part in scenarios.split(",")]
+        if not all(len(part) <= 2 and all(number.isdecimal() for number in part) for part in parts):
+            raise NotEvaluable(f"scenarios must look like 1000:1050, 1000 or 1000,1003:1010, got {scenarios!r}.")
+        ranges = [range(int(part[0]), int(part[1]) if len(part) == 2 else int(part[0]) + 1) for part in parts]
+        result = [number for part in ranges for number in part] if all(ranges) else []
+    else:
+        result = list(scenarios)
+        for number in result:
+            check_integer("scenarios", number, low=0)
+        result = [int(number) for number in result]
+    if not result:
+        raise NotEvaluable(f"scenarios: a range is empty in {scenarios!r} (the end of a range is not part of it).")
+    if len(set(result)) < len(result):
+        raise NotEvaluable(f"scenarios must differ from each other, got {scenarios!r}.")
+    return result
+
+
+def _episodes(runner: Runner, numbers: list[int], jobs: int) -> Iterator[tuple[dict[str, Any], DrivenPath | None]]:
+    if jobs == 1 or len(numbers) == 1:
+        yield from map(runner.episode, numbers)
+        return
+    task = runner.task
+    if isinstance(task.env, str) and runner.env.spec is not None:
+        task = task._replace(env=runner.env.spec)  # the processes need not know the id
+    if isinstance(task.policy, BaseAlgorithm):
+        archive = io.BytesIO()
+        task.policy.save(archive)
+        task = task._replace(policy=SavedModel(type(task.policy), archive.getvalue()))
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(min(jobs, len(numbers)), context, _start_process, (CloudpickleWrapper(task),)) as pool:
+        yield from pool.map(_run_episode, numbers)
+
+
+_runner: Runner  # of a worker process
+
+
+def _start_process(task: CloudpickleWrapper) -> None:
+    global _runner
+    th.set_num_threads(1)
+    _runner = Runner(task.var)
+
+
+def _run_episode(number: int) -> tuple[dict[str, Any], DrivenPath | None]:
+    return _runner.episode(number)

@@ -1,0 +1,278 @@
+"""``python -m sb3_chac evaluate``: a trained model, or an expert, on held-out scenarios."""
+
+import argparse
+import ast
+import inspect
+import json
+import os
+import pickle
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import torch as th
+from huggingface_sb3 import EnvironmentName
+from rl_zoo3 import utils
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.vec_env import VecNormalize
+
+from sb3_chac.common import pictures
+from sb3_chac.common.episodes import NotEvaluable, Runner, SavedModel, Task, make_env
+from sb3_chac.common.evaluation import evaluate, scenario_list
+from sb3_chac.zoo.registration import add_algorithms
+
+DESCRIPTION = """Run one deterministic episode per scenario and print return, safety cost, success rate, route completion
+and steps, as mean ± standard deviation over the episodes. The results do not depend on --jobs.
+
+  sb3-chac evaluate logs/chac/SafeDrive-v0_1/best_model.zip --env SafeDrive-v0 --scenarios 1000:1050 --json chac.json
+  sb3-chac evaluate --expert scripted --scenarios 1000:1012 --plot paths.png --video drive.mp4
+  sb3-chac evaluate logs/sac/Pendulum-v1_1/Pendulum-v1.zip --env Pendulum-v1 --episodes 20
+
+If <folder of the model>/<env>/vecnormalize.pkl exists, where RL-Zoo3 leaves it, observations are normalized with it.
+Cost, success and route completion are only reported if the environment's info has 'cost', 'is_success' and
+'route_completion' in every episode; the JSON file leaves out what is not there. Load models that you trust only."""
+
+
+def make_parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        "sb3-chac evaluate", description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    who = parser.add_argument_group("who acts (one of the two)")
+    who.add_argument("model", nargs="?", type=Path, metavar="MODEL.zip", help="a model saved by Stable-Baselines3")
+    who.add_argument("--expert", metavar="NAME", help="an expert of the environment, e.g. scripted or scripted-ideal")
+    who.add_argument("--algo", metavar="NAME", help="algorithm of the model as RL-Zoo3 calls it (default: read from the file)")
+    where = parser.add_argument_group("where")
+    where.add_argument(
+        "--env", default="SafeDrive-v0", metavar="ID", help="environment, also module:ID (default: %(default)s)"
+    )
+    where.add_argument("--env-kwargs", nargs="+", default=[], metavar="KEY:VALUE", help="passed to it, Python literals")
+    count = where.add_mutually_exclusive_group()
+    count.add_argument(
+        "--scenarios",
+        default="1000:1050",
+        metavar="RANGE",
+        help="1000:1050 (without 1050), 1000 or 1000,1003:1010 (%(default)s)",
+    )
+    count.add_argument("--episodes", type=int, metavar="N", help="for environments without scenarios: number of episodes")
+    where.add_argument("--seed", type=int, default=0, help="the episodes' seeds derive from it (default: %(default)s)")
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    where.add_argument(
+        "--jobs", type=int, default=cores, metavar="N", help="number of processes (default: %(default)s, the cores)"
+    )
+    what = parser.add_argument_group("what is written, besides the table")
+    what.add_argument("--json", type=Path, metavar="FILE", help="summary, settings, versions and one record per episode")
+    what.add_argument("--plot", type=Path, metavar="FILE.png", help="the driven paths on the map, up to 12 scenarios")
+    what.add_argument("--video", type=Path, metavar="FILE", help=".mp4 or .gif of one episode")
+    what.add_argument("--video-scenario", type=int, metavar="K", help="scenario (or episode) to film (default: the first)")
+    return parser
+
+
+def main(arguments: list[str]) -> None:
+    """
+    :param arguments: of the command line, after ``evaluate``
+    """
+    parser = make_parser()
+    args = parser.parse_args(arguments)
+    if (args.model is None) == (args.expert is None):
+        parser.exit(2, f"{parser.prog}: error: give either a MODEL.zip or --expert NAME\n")
+
+    th.set_num_threads(1)
+    try:
+        run(args)
+    except (NotEvaluable, FileNotFoundError) as error:
+        parser.exit(2, f"{parser.prog}: error: {error}\n")
+
+
+def run(args: argparse.Namespace) -> None:
+    """
+    :param args: see ``make_parser``
+    :raises FileNotFoundError: if the model, or the folder of an output file, does not exist
+    :raises NotEvaluable: for whatever else does not fit, found before the episodes run
+    """
+    check_output("--json", args.json)
+    check_output("--plot", args.plot, pictures.PLOT_SUFFIXES)
+    check_output("--video", args.video, pictures.VIDEO_SUFFIXES)
+    for option, low in [("seed", 0), ("jobs", 1), ("episodes", 1)]:
+        value = getattr(args, option)
+        if value is not None and value < low:
+            raise NotEvaluable(f"--{option} must be at least {low}, got {value}.")
+    numbers = scenario_list(args.scenarios) if args.episodes is None else list(range(args.episodes))
+    filmed = numbers[0] if args.video_scenario is None else args.video_scenario
+    if filmed not in numbers:
+        raise NotEvaluable(f"--video-scenario {filmed} is not among those that are evaluated.")
+
+    env_kwargs = parse_env_kwargs(args.env_kwargs)
+    policy, normalize, who = args.expert, None, {"expert": args.expert}
+    if args.model is not None:
+        path, algo, algorithm = find_algorithm(args.model, args.algo)
+        env = make_env(args.env, env_kwargs)
+        policy = load_model(path, algo, algorithm, env)
+        env.close()
+        statistics, normalize = find_normalization(path, args.env)
+        print(f"{path}: {algorithm.__name__}" + (f", observations normalized with {statistics}" if normalize else ""))
+        who = {"model": str(path), "algo": algo}
+
+    task = Task(policy, args.env, env_kwargs, normalize, args.seed, args.episodes is None)
+    if args.plot or args.video:
+        with Runner(task) as runner:
+            if args.plot:
+                pictures.check_can_plot(runner, numbers[0])
+            if args.video:
+                pictures.check_can_render(runner)
+
+    evaluation = evaluate(
+        policy,
+        args.env,
+        args.scenarios,
+        episodes=args.episodes,
+        seed=args.seed,
+        jobs=args.jobs,
+        env_kwargs=env_kwargs,
+        normalize=normalize,
+        record_paths=args.plot is not None,
+        progress_bar=True,
+    )
+    evaluation.settings |= who
+    print(evaluation.table())
+    if args.json:
+        args.json.write_text(evaluation.to_json() + "\n")
+    if args.plot:
+        with Runner(task) as runner:
+            pictures.save_plot(args.plot, runner, evaluation)
+    if args.video:
+        with Runner(task, render_mode="rgb_array") as runner:
+            pictures.save_video(args.video, runner, filmed)
+    for file in filter(None, (args.json, args.plot, args.video)):
+        print(f"Saved {file}")
+
+
+def check_output(option: str, path: Path | None, suffixes: tuple[str, ...] = ()) -> None:
+    """
+    :param option: for the message
+    :param path: file that is to be written at the end, None if none
+    :param suffixes: those possible, all if empty
+    :raises FileNotFoundError: if its folder does not exist
+    :raises NotEvaluable: if it cannot be written, or has another suffix
+    """
+    if path is None:
+        return
+    if suffixes and path.suffix not in suffixes:
+        raise NotEvaluable(f"{option} {path}: the file name must end with {' or '.join(suffixes)}.")
+    if not path.parent.is_dir():
+        raise FileNotFoundError(f"{option} {path}: the folder {path.parent} does not exist, create it first.")
+    existed = path.exists()
+    try:
+        path.open("ab").close()
+    except OSError as error:
+        raise NotEvaluable(f"{option} {path}: cannot be written ({error.strerror}).") from error
+    if not existed:
+        path.unlink()
+
+
+def parse_env_kwargs(pairs: list[str]) -> dict[str, Any]:
+    """
+    :param pairs: such as "density:0.1"
+    :raises NotEvaluable: unless each has a key and a Python literal
+    """
+    result = {}
+    for pair in pairs:
+        key, _, value = pair.partition(":")
+        try:
+            result[key] = ast.literal_eval(value)
+        except (ValueError, SyntaxError) as error:
+            hint = "must look like key:value with a Python literal, e.g. density:0.1 or name:\"'text'\""
+            raise NotEvaluable(f"--env-kwargs {hint}, got {pair!r}.") from error
+    return result
+
+
+def find_algorithm(path: Path, algo: str | None) -> tuple[Path, str, type[BaseAlgorithm]]:
+    """
+    :param path: a saved model, with or without ".zip"
+    :param algo: name of the algorithm, read from the file if None: the module of the model's policy and the arguments stored
+        with it tell, and the path where they do not
+    :return: path of the file, name and class of the algorithm
+    :raises FileNotFoundError: if there is no such file
+    :raises NotEvaluable: if it is not a model of Stable-Baselines3, or its algorithm is not known
+    """
+    add_algorithms(utils)
+    if algo is not None and algo not in utils.ALGOS:
+        raise NotEvaluable(f"--algo {algo!r} is not known, choose from {', '.join(sorted(utils.ALGOS))}.")
+    if not path.is_file() and path.with_name(path.name + ".zip").is_file():
+        path = path.with_name(path.name + ".zip")
+    if not path.is_file():
+        raise FileNotFoundError(f"There is no model {path}.")
+    try:
+        with zipfile.ZipFile(path) as archive:
+            data = json.loads(archive.read("data"))
+        module = data["policy_class"]["__module__"]
+    except (zipfile.BadZipFile, KeyError, ValueError, TypeError) as error:
+        raise NotEvaluable(f"{path} is not a model saved by Stable-Baselines3.") from error
+    if algo is None:
+        algo = guess_algorithm(path, module, set(data), utils.ALGOS)
+    return path, algo, utils.ALGOS[algo]
+
+
+def guess_algorithm(path: Path, module: str, stored: set[str], algorithms: dict[str, type[BaseAlgorithm]]) -> str:
+    """
+    :param path: of the saved model, e.g. logs/<algo>/<env>_1/<env>.zip or <algo>-<env>.zip
+    :param module: the one that defines its policy
+    :param stored: names of the attributes stored with it
+    :param algorithms: classes by name
+    :return: name of the algorithm
+    :raises NotEvaluable: if it is ambiguous
+    """
+
+    def fit(algo: str) -> int:
+        parameters = set(inspect.signature(algorithms[algo]).parameters)
+        return len(parameters & stored) - len(parameters - stored)
+
+    candidates = [
+        algo
+        for algo, algorithm in algorithms.items()
+        if module in {policy.__module__ for policy in algorithm.policy_aliases.values()}
+    ]
+    if set(candidates) != {"ddpg", "td3"}:  # DDPG stores what TD3 stores
+        best = [algo for algo in candidates if fit(algo) == max(map(fit, candidates))]
+        if len(best) == 1:
+            return best[0]
+        candidates = best or list(algorithms)
+    folders = {folder.name for folder in path.resolve().parents[:2]}
+    named = [
+        algo for algo in candidates if algo in folders or path.stem == algo or path.name.startswith((f"{algo}-", f"{algo}_"))
+    ]
+    if named:
+        return max(named, key=len)
+    raise NotEvaluable(f"{path} may be any of {', '.join(sorted(candidates))}: name its algorithm with --algo.")
+
+
+def load_model(path: Path, algo: str, algorithm: type[BaseAlgorithm], env: gym.Env) -> BaseAlgorithm:
+    """
+    :param algo: name of the algorithm, for the message
+    :param algorithm: its class
+    :param env: the environment that the model is to act in
+    :return: the model, on the CPU, fit for acting only
+    :raises NotEvaluable: if it does not load, or does not fit the environment
+    """
+    try:
+        return SavedModel(algorithm, path.read_bytes()).load(env)
+    except Exception as error:  # whatever a model of another algorithm, version or environment leads to
+        raise NotEvaluable(
+            f"{path} cannot be loaded as {algo} for {env.unwrapped}: {error or type(error).__name__}"
+        ) from error
+
+
+def find_normalization(model: Path, env: str) -> tuple[Path, VecNormalize | None]:
+    """
+    :return: where RL-Zoo3 leaves the statistics of a model's observations, and the VecNormalize there, None if there is none
+    :raises NotEvaluable: if the file cannot be read
+    """
+
+    path = model.parent / EnvironmentName(env) / "vecnormalize.pkl"
+    if not path.is_file():
+        return path, None
+    try:
+        with path.open("rb") as file:
+            return path, pickle.load(file)
+    except Exception as error:  # pickle raises nearly anything
+        raise NotEvaluable(f"{path} cannot be read: {error}") from error
