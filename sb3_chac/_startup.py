@@ -1,17 +1,22 @@
-"""Make RL-Zoo3 know our algorithms, without being asked.
+"""Make RL-Zoo3 know our algorithms and gymnasium our environments, without being asked.
 
 Python runs ``install`` at every start (through ``sb3_chac.pth``, or ``sb3_chac.start`` from Python 3.15 on, PEP 829):
 RL-Zoo3 has no plug-in point, and its ``--algo`` accepts only what is registered before its arguments are read.
-Only the standard library is imported here, and nothing else happens until RL-Zoo3 itself is imported.
-Set ``SB3_CHAC_NO_AUTOLOAD=1`` to switch it off; ``python -m sb3_chac train ...`` works all the same.
+Only the standard library is imported here, and nothing else happens until one of the two is imported.
+Set ``SB3_CHAC_NO_AUTOLOAD=1`` to switch it off; ``python -m sb3_chac train ...`` and ``import sb3_chac.envs`` work all
+the same.
 """
 
 import os
 import sys
 from typing import Any
 
-# Modules of RL-Zoo3 -> function of sb3_chac.zoo.registration that extends them once they are imported
-_EXTENSIONS = {"rl_zoo3.utils": "add_algorithms", "rl_zoo3.exp_manager": "add_experiments"}
+# Modules -> function of sb3_chac.zoo.registration that extends them once they are imported
+_EXTENSIONS = {
+    "gymnasium.envs": "add_environments",
+    "rl_zoo3.utils": "add_algorithms",
+    "rl_zoo3.exp_manager": "add_experiments",
+}
 
 
 class _ZooFinder:
@@ -37,10 +42,11 @@ class _ZooFinder:
                 from sb3_chac.zoo import registration
 
                 getattr(registration, extension)(module)
-            except Exception as error:  # a broken installation of ours must not break RL-Zoo3
+            except Exception as error:  # a broken installation of ours must not break theirs
                 import warnings
 
-                warnings.warn(f"sb3_chac is not registered with rl_zoo3, reinstall or uninstall it: {error!r}")
+                package = module.__name__.partition(".")[0]
+                warnings.warn(f"sb3_chac is not registered with {package}, reinstall or uninstall it: {error!r}")
 
         loader.exec_module = exec_and_extend
 

@@ -1,4 +1,4 @@
-"""What RL-Zoo3 has to be told of our algorithms."""
+"""What RL-Zoo3 has to be told of our algorithms, and gymnasium of our environments."""
 
 import functools
 import importlib
@@ -28,9 +28,21 @@ def hyperparams_file(algo: str) -> Path:
 
 
 def register() -> None:
-    """Add our algorithms, hyperparameters and Optuna samplers to RL-Zoo3. Calling it again changes nothing."""
+    """
+    Add our environments to gymnasium, and our algorithms, hyperparameters and Optuna samplers to RL-Zoo3.
+
+    Calling it again changes nothing.
+    """
+    add_environments(importlib.import_module("gymnasium.envs"))
     add_algorithms(importlib.import_module("rl_zoo3.utils"))
     add_experiments(importlib.import_module("rl_zoo3.exp_manager"))
+
+
+def add_environments(envs: ModuleType) -> None:
+    """
+    :param envs: ``gymnasium.envs``, whose registry our package fills when it is imported
+    """
+    importlib.import_module("sb3_chac.envs")
 
 
 def add_algorithms(utils: ModuleType) -> None:

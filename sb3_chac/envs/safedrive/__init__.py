@@ -1,0 +1,3 @@
+from sb3_chac.envs.safedrive.env import SafeDriveEnv
+
+__all__ = ["SafeDriveEnv"]

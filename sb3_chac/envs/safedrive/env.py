@@ -1,0 +1,389 @@
+"""SafeDrive-v0: the driving task of the paper's benchmark, on highway-env."""
+
+from collections import OrderedDict
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from highway_env.road.road import Road
+
+from sb3_chac.common.checks import check_integer, check_range
+from sb3_chac.envs.safedrive.driver import IMPERFECTIONS, ScriptedDriver
+from sb3_chac.envs.safedrive.geometry import SPACING, Pose, boxes_overlap, wrap_angle
+from sb3_chac.envs.safedrive.lidar import Lidar
+from sb3_chac.envs.safedrive.map import BLOCKS, HALF_WIDTH, LANES, OBSTACLE_SIZES, Map
+from sb3_chac.envs.safedrive.traffic import CAR_LENGTH, CAR_WIDTH, Traffic
+from sb3_chac.envs.safedrive.vehicle import MAX_SPEED, Ego
+
+STEPS_PER_SECOND, SUBSTEPS = 10, 2
+ARRIVES_BEFORE_END = 5.0  # [m]
+CHECKPOINTS = np.array([8.0, 16.0, 26.0, 38.0, 50.0])  # [m] ahead on the route
+N_EGO, N_NAVIGATION = 9, 2 * len(CHECKPOINTS)
+CONTACT_MEMORY = 10  # steps without contact after which touching the same object is a new collision
+PARKED_TOWED_AFTER = 50  # steps after a collision with a parked vehicle
+SCENES_KEPT = 64
+
+
+class Scene(NamedTuple):
+    """What a scenario number stands for."""
+
+    map: Map
+    traffic: Traffic
+    lane: float  # [m] offset of the lane in which the ego starts
+    obstacle_positions: np.ndarray
+    obstacle_headings: np.ndarray
+    obstacle_sizes: np.ndarray  # length and width
+
+
+class SafeDriveEnv(gym.Env):
+    """
+    Drive a route through seeded maps of straights, curves, ramps, roundabouts, T-intersections and intersections, among
+    traffic, cones, warning triangles and parked vehicles; ten decisions per second.
+
+    **Actions**, shape (2,), in [-1, 1]: steering (1 is 0.6 rad of the front wheels to the right) and acceleration (1 is
+    4 m/s2, -1 brakes as much; the vehicle does not drive backwards; top speed 15 m/s).
+
+    **Observations**, shape (259,), in [-1, 1]; t(x) stands for tanh(x):
+
+    ======= ==============================================================================================
+    0       distance to the left edge of the carriageway, d / 4 m - 1
+    1       distance to the right edge, alike
+    2       heading against the route, t(angle / 0.15)
+    3       speed, 2 v / v_max - 1
+    4       angle of the front wheels, t(angle / 0.15)
+    5, 6    last action
+    7       yaw rate, t(rate / 0.3 per s)
+    8       offset from the middle of the nearest lane, to the right, t(d / 0.5 m)
+    9-18    checkpoints on the middle of the carriageway 8, 16, 26, 38 and 50 m ahead, each: bearing to the right,
+            t(angle / 0.4), and heading of the route there, t(angle / 0.6), both against the ego's heading
+    19-258  240 lidar rays, clockwise from straight ahead, as closeness: 0 free up to 50 m, 1 touching
+    ======= ==============================================================================================
+
+    **Reward**: ``displacement_reward`` per metre of progress along the route, ``speed_reward`` v / v_max per step, less
+    ``collision_penalty`` per collision, ``arrival_reward`` at the destination, less ``out_of_road_penalty`` off the
+    carriageway (Section V of the paper).
+
+    **Cost** (``info["cost"]``): 1 per collision, counted when a contact begins. Collisions do not end the episode: cones and
+    triangles fall over; vehicles stop and are towed away after 5 s, and the ego stops if it ran into one.
+
+    **Ends** (terminated): at the destination, and when the middle of the vehicle leaves the carriageway. Truncated after
+    ``horizon`` steps.
+
+    **Info**: ``cost``, ``collision`` (one began), ``contact`` (touching something), ``out_of_road``, ``arrive_dest``,
+    ``is_success``, ``route_completion`` (0 to 1), ``speed`` [m/s], ``episode_cost``, ``scenario``.
+
+    ``reset(options={"scenario": k})`` drives map k, any integer; otherwise the map is drawn from ``start_scenario``,
+    ``start_scenario`` + 1, ...
+
+    :param start_scenario: the first of the maps (by custom, 100-119 are for training, 1000-1049 for testing)
+    :param num_scenarios: number of maps
+    :param traffic_density: of moving vehicles, 0 (none) to 3; 1 is about one per 60 m of the route, two at each junction
+        and ramp, and one per 100 m that comes the other way
+    :param obstacle_density: 0 (none) to 1: share of the places for obstacles that have some
+    :param blocks: how many blocks a map has (1 to 12), or their letters in order: S straight, C curve, R ramp,
+        O roundabout, T T-intersection, X intersection
+    :param horizon: [steps of 0.1 s] after which an episode is truncated
+    :param displacement_reward: c_disp, per metre
+    :param speed_reward: c_speed, per step at top speed
+    :param collision_penalty: R_collision, subtracted per collision
+    :param arrival_reward: R_term at the destination
+    :param out_of_road_penalty: R_term off the road, subtracted
+    :param render_mode: "rgb_array", "human" or None
+    :param show_lidar: whether pictures show the lidar's rays
+    :raises ValueError: for an argument out of its range
+    """
+
+    metadata = {"render_modes": ["rgb_array", "human"], "render_fps": STEPS_PER_SECOND}  # noqa: RUF012
+
+    def __init__(
+        self,
+        start_scenario: int = 100,
+        num_scenarios: int = 20,
+        traffic_density: float = 0.6,
+        obstacle_density: float = 0.35,
+        blocks: int | str = 4,
+        horizon: int = 1000,
+        displacement_reward: float = 1.0,
+        speed_reward: float = 0.1,
+        collision_penalty: float = 5.0,
+        arrival_reward: float = 10.0,
+        out_of_road_penalty: float = 5.0,
+        render_mode: str | None = None,
+        show_lidar: bool = False,
+    ) -> None:
+        check_integer("start_scenario", start_scenario, low=-(2**62))
+        check_integer("num_scenarios", num_scenarios, low=1)
+        check_range("traffic_density", traffic_density, low=0, high=3)
+        check_range("obstacle_density", obstacle_density, low=0, high=1)
+        check_integer("horizon", horizon, low=1)
+        if isinstance(blocks, str):
+            if not 1 <= len(blocks) <= 12 or set(blocks) - set(BLOCKS):
+                raise ValueError(f"blocks must be 1 to 12 letters out of {BLOCKS!r}, or a number of blocks, got {blocks!r}.")
+        else:
+            check_integer("blocks", blocks, low=1)
+            check_range("blocks", blocks, high=12)
+        coefficients = dict(
+            displacement_reward=displacement_reward, speed_reward=speed_reward, collision_penalty=collision_penalty,
+            arrival_reward=arrival_reward, out_of_road_penalty=out_of_road_penalty,
+        )  # fmt: skip
+        for name, value in coefficients.items():
+            check_range(name, value, low=0.0)
+        if render_mode is not None and render_mode not in self.metadata["render_modes"]:
+            raise ValueError(f"render_mode must be None or one of {self.metadata['render_modes']}, got {render_mode!r}.")
+        self.start_scenario, self.num_scenarios = int(start_scenario), int(num_scenarios)
+        self.traffic_density, self.obstacle_density = traffic_density, obstacle_density
+        self.blocks = blocks if isinstance(blocks, str) else int(blocks)
+        self.horizon = int(horizon)
+        self.displacement_reward, self.speed_reward, self.collision_penalty = (
+            displacement_reward,
+            speed_reward,
+            collision_penalty,
+        )
+        self.arrival_reward, self.out_of_road_penalty = arrival_reward, out_of_road_penalty
+        self.render_mode, self.show_lidar = render_mode, show_lidar
+        self.hud: dict[str, Any] = {}  # what wrappers want to have shown beside the speed
+
+        self.action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
+        self.lidar = Lidar()
+        self.observation_space = spaces.Box(-1.0, 1.0, (N_EGO + N_NAVIGATION + self.lidar.rays,), np.float32)
+        self._scenes: OrderedDict[int, Scene] = OrderedDict()
+        self._viewer: Any = None
+
+    # Scenes
+
+    def _scene(self, scenario: int) -> Scene:
+        """The scene of a scenario, made when it is first needed."""
+        if scenario in self._scenes:
+            self._scenes.move_to_end(scenario)
+            return self._scenes[scenario]
+        road_map = Map(scenario, self.blocks, self.obstacle_density)
+        rng = np.random.default_rng([abs(scenario), int(scenario < 0), 1])
+        lane = float(rng.choice(LANES))
+        traffic = Traffic(road_map, self.traffic_density, rng)
+        obstacles = road_map.obstacles
+        s, lateral = np.array([(o.s, o.lateral) for o in obstacles]).reshape(-1, 2).T
+        positions, headings = traffic.poses(np.zeros(len(s), dtype=int), s, lateral)
+        sizes = np.array([OBSTACLE_SIZES[o.kind] for o in obstacles]).reshape(-1, 2)
+        self._scenes[scenario] = Scene(road_map, traffic, lane, positions, headings, sizes)
+        if len(self._scenes) > SCENES_KEPT:
+            self._scenes.popitem(last=False)
+        return self._scenes[scenario]
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
+        """
+        :param options: {"scenario": k} to drive map k
+        :raises ValueError: if k is not an integer
+        """
+        super().reset(seed=seed)
+        if options and "scenario" in options:
+            check_integer("options['scenario']", options["scenario"], low=-(2**62))
+            self.scenario = int(options["scenario"])
+        else:
+            self.scenario = self.start_scenario + int(self.np_random.integers(self.num_scenarios))
+        self.scene = self._scene(self.scenario)
+        self.map, self.traffic = self.scene.map, self.scene.traffic
+        self.traffic.reset()
+        self.s, self.lateral = 5.0, self.scene.lane
+        self.ego = Ego(self.map.start.shifted(self.s, self.lateral))
+        self.heading_error = 0.0
+        self.last_action = np.zeros(2)
+        self.steps, self.episode_cost = 0, 0
+        self.collisions, self.contact, self.arrived, self.out_of_road = 0, False, False, False
+        self._touched: dict[tuple[str, int], int] = {}  # object -> step of the last contact
+        self._tow: dict[int, int] = {}  # parked vehicle that was hit -> step at which it is gone
+        self._find_boxes()
+        if self.render_mode == "human":
+            self.render()
+        return self._observe(), self._info()
+
+    # Dynamics
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        ego = self.ego
+        action = np.clip(np.asarray(action, dtype=float), -1.0, 1.0)
+        before = Pose(ego.position[0], ego.position[1], ego.heading)
+        ego.control(action[0], action[1])
+        for _ in range(SUBSTEPS):
+            ego.step(1 / (STEPS_PER_SECOND * SUBSTEPS))
+        previous_s = self.s
+        self._locate()
+        self.traffic.step(1 / STEPS_PER_SECOND, self.s, self.lateral, ego.speed, ego.position, ego.heading)
+        self.steps += 1
+        self.last_action = action
+        for obstacle in [o for o, when in self._tow.items() if self.steps >= when]:
+            self._tow.pop(obstacle)
+            self.traffic.remove_obstacle(obstacle)
+        self._find_boxes()
+        self._collide(before)
+
+        self.arrived = self.s >= self.map.length - ARRIVES_BEFORE_END
+        self.out_of_road = abs(self.lateral) > HALF_WIDTH and not self.arrived
+        reward = self.displacement_reward * (self.s - previous_s) + self.speed_reward * ego.speed / MAX_SPEED
+        reward += self.arrival_reward * self.arrived - self.out_of_road_penalty * self.out_of_road
+        reward -= self.collision_penalty * self.collisions
+        if self.render_mode == "human":
+            self.render()
+        terminated = self.arrived or self.out_of_road
+        return self._observe(), float(reward), terminated, self.steps >= self.horizon, self._info()
+
+    def _locate(self) -> None:
+        """Where the ego is on the route, looked for close to where it was (the route may pass near itself)."""
+        route, ego = self.map.route, self.ego
+        first = max(0, int(self.s / SPACING) - 16)
+        d = ego.position - route[first : first + 40, :2]
+        nearest = int(np.argmin(d[:, 0] ** 2 + d[:, 1] ** 2))
+        heading, curvature = route[first + nearest, 2:]
+        x, y = d[nearest]
+        along = float(x * np.cos(heading) + y * np.sin(heading))
+        self.s = (first + nearest) * SPACING + along
+        self.lateral = float(y * np.cos(heading) - x * np.sin(heading))
+        self.heading_error = float(wrap_angle(ego.heading - heading - curvature * along))
+
+    def _find_boxes(self) -> None:
+        """Everything that can be hit or seen: first the cars of the traffic that are there, then the obstacles."""
+        traffic, scene = self.traffic, self.scene
+        there = np.flatnonzero(traffic.obstacle_there)
+        n_cars = len(traffic.visible)
+        self.box_positions = np.concatenate([traffic.positions, scene.obstacle_positions[there]])
+        self.box_headings = np.concatenate([traffic.headings, scene.obstacle_headings[there]])
+        self.box_lengths = np.concatenate([np.full(n_cars, CAR_LENGTH), scene.obstacle_sizes[there, 0]])
+        self.box_widths = np.concatenate([np.full(n_cars, CAR_WIDTH), scene.obstacle_sizes[there, 1]])
+        self.box_ids = [("car", int(i)) for i in traffic.visible] + [("obstacle", int(i)) for i in there]
+
+    def _collide(self, before: Pose) -> None:
+        """
+        Count the contacts that begin, and let them have their effect.
+
+        :param before: pose of the ego before this step
+        """
+        ego = self.ego
+        self.collisions, self.contact = 0, False
+        d = self.box_positions - ego.position
+        near = np.flatnonzero(d[:, 0] ** 2 + d[:, 1] ** 2 < (ego.LENGTH + CAR_LENGTH) ** 2)
+        if len(near) == 0:
+            return
+        size = ego.LENGTH, ego.WIDTH
+        boxes = self.box_positions[near], self.box_headings[near], self.box_lengths[near], self.box_widths[near]
+        hits = near[boxes_overlap(ego.position, ego.heading, *size, *boxes)]
+        for i in hits:
+            kind, index = self.box_ids[i]
+            if self.steps - self._touched.get((kind, index), -CONTACT_MEMORY) >= CONTACT_MEMORY:
+                self.collisions += 1
+            self._touched[kind, index] = self.steps
+            self.contact = True
+            if kind == "obstacle" and self.map.obstacles[index].kind != "parked":
+                self.traffic.remove_obstacle(index)
+                continue
+            if kind == "car":
+                self.traffic.crash(index)
+            else:
+                self._tow.setdefault(index, self.steps + PARKED_TOWED_AFTER)
+            if d[i] @ ego.direction > 0:  # the ego ran into it
+                ego.position, ego.heading, ego.speed = np.array(before[:2]), before.heading, 0.0
+        self.episode_cost += self.collisions
+        if len(hits):
+            self._locate()
+            self._find_boxes()
+
+    # What the agent is told
+
+    def _observe(self) -> np.ndarray:
+        ego, route = self.ego, self.map.route
+        observation = np.empty(N_EGO + N_NAVIGATION + self.lidar.rays, np.float32)
+        off_lane = self.lateral - LANES[self.lateral > 0]
+        observation[:N_EGO] = (
+            self.lateral / HALF_WIDTH, -self.lateral / HALF_WIDTH, np.tanh(self.heading_error / 0.15),
+            2 * ego.speed / MAX_SPEED - 1, np.tanh(ego.steering / 0.15), *self.last_action,
+            np.tanh(ego.yaw_rate / 0.3), np.tanh(off_lane / 0.5),
+        )  # fmt: skip
+        points = route[np.minimum(((self.s + CHECKPOINTS) / SPACING).astype(int), len(route) - 1)]
+        d = points[:, :2] - ego.position
+        bearing = wrap_angle(np.arctan2(d[:, 1], d[:, 0]) - ego.heading)
+        observation[N_EGO : N_EGO + N_NAVIGATION : 2] = np.tanh(bearing / 0.4)
+        observation[N_EGO + 1 : N_EGO + N_NAVIGATION : 2] = np.tanh(wrap_angle(points[:, 2] - ego.heading) / 0.6)
+        observation[N_EGO + N_NAVIGATION :] = 1 - self.scan() / self.lidar.reach
+        return np.clip(observation, -1.0, 1.0)
+
+    def scan(self) -> np.ndarray:
+        """
+        :return: [m] distances along the lidar's rays, shape (240,)
+        """
+        return self.lidar.scan(
+            self.ego.position, self.ego.heading, self.box_positions, self.box_headings, self.box_lengths, self.box_widths
+        )
+
+    def _info(self) -> dict[str, Any]:
+        return {
+            "cost": float(self.collisions),
+            "collision": self.collisions > 0,
+            "contact": self.contact,
+            "out_of_road": self.out_of_road,
+            "arrive_dest": self.arrived,
+            "is_success": self.arrived,
+            "route_completion": float(np.clip(self.s / (self.map.length - ARRIVES_BEFORE_END), 0.0, 1.0)),
+            "speed": self.ego.speed,
+            "episode_cost": float(self.episode_cost),
+            "scenario": self.scenario,
+        }
+
+    def scripted_driver(self, name: str = "scripted") -> ScriptedDriver:
+        """
+        :param name: "scripted" (with a human's imperfections) or "scripted-ideal" (without)
+        :return: a driver for this environment
+        :raises ValueError: for another name
+        """
+        if name not in IMPERFECTIONS:
+            raise ValueError(f"{name!r} is not a driver of SafeDrive, choose from {sorted(IMPERFECTIONS)}.")
+        return ScriptedDriver(self, **IMPERFECTIONS[name])  # type: ignore[arg-type]
+
+    @property
+    def position(self) -> np.ndarray:
+        """[m] of the ego, shape (2,)."""
+        return self.ego.position.copy()
+
+    # Pictures
+
+    def render(self) -> np.ndarray | None:
+        """
+        :return: the picture, shape (600, 800, 3), uint8, with render_mode "rgb_array", else None
+        :raises ResetNeeded: before the first reset
+        :raises RuntimeError: if render_mode is "human" and there is no display
+        """
+        if self.render_mode is None:
+            gym.logger.warn("render() does nothing without a render_mode, for example render_mode='rgb_array'.")
+            return None
+        if not hasattr(self, "ego"):
+            raise gym.error.ResetNeeded("Call reset() before render().")
+        if self._viewer is None:
+            from sb3_chac.envs.safedrive.render import Viewer
+
+            self._viewer = Viewer(self)
+        if self.render_mode == "rgb_array":
+            return self._viewer.frame()
+        self._viewer.show()
+        return None
+
+    def close(self) -> None:
+        if self._viewer is not None:
+            self._viewer.close()
+            self._viewer = None
+
+    def plot_map(self, axes: Any) -> None:
+        """
+        :param axes: of matplotlib, where the map of the current scenario is drawn, in metres, y downwards
+        """
+        from sb3_chac.envs.safedrive.plot import plot_map
+
+        plot_map(self.map, axes)
+
+    @property
+    def road(self) -> Road:
+        """highway-env's road of the current map: the lanes, without vehicles."""
+        if self._road is None or self._road[0] is not self.map:
+            from sb3_chac.envs.safedrive.roads import road_network
+
+            self._road = self.map, Road(road_network(self.map))
+        return self._road[1]
+
+    _road: tuple[Map, Road] | None = None
