@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from sb3_chac.envs.safedrive.env import SafeDriveEnv
 
 SIGHT = 55.0  # [m]
-EARLY, EARLY_COST = 35.0, 8.0  # [m] ahead of something in its lane, from which on it prefers the other one, and how much
+EARLY, EARLY_COST = 40.0, 8.0  # [m] ahead of something in its lane, from which on it prefers the other one, and how much
 LANE_CHANGE_COST = 2.5
 INDIFFERENCE = 0.3  # differences in cost that do not matter: plans are mixed, so that similar situations get similar actions
 LATERAL_ACCELERATION = 2.5  # [m/s2] in curves
@@ -153,8 +153,7 @@ class ScriptedDriver:
         :param times: [s] from now, shape (m,)
         """
         env, traffic = self.env, self.env.traffic
-        d = env.box_positions - env.ego.position
-        near = np.flatnonzero(d[:, 0] ** 2 + d[:, 1] ** 2 < SIGHT**2)
+        near = env.seen
         n_cars = int((near < len(traffic.visible)).sum())
         cars = traffic.visible[near[:n_cars]]
         speed = np.where(traffic.state[cars] == DRIVING, traffic.speed[cars], 0.0)
@@ -203,7 +202,7 @@ class ScriptedDriver:
         before = np.concatenate([np.full((len(ACCELERATIONS), 1), ego.speed), speeds[:, :-1]], axis=1)
         way = np.cumsum((before + speeds) / 2, axis=1) * TIMES[0]
         gaps = np.array([others.ahead[np.abs(others.laterals - target) < 2.0].min(initial=EARLY) for target in TARGETS])
-        slope = float(np.clip(LANE_WIDTH / max(gaps[int(env.lateral > 0)] - 8.0, 1.0), GENTLE_SLOPE, STEEP_SLOPE))
+        slope = float(np.clip(LANE_WIDTH / max(gaps[int(env.lateral > 0)] - 13.0, 1.0), GENTLE_SLOPE, STEEP_SLOPE))
         to_go = TARGETS - env.lateral
         moved = np.minimum(np.abs(to_go)[:, None, None], np.minimum(slope * way, LATERAL_SPEED * TIMES))
         lateral = env.lateral + np.sign(to_go)[:, None, None] * moved
@@ -245,7 +244,9 @@ class ScriptedDriver:
         if self.boxed_in > 8.0:
             hit &= moves  # nothing else helps: push through
         first = np.where(hit.any(axis=-1), TIMES[np.argmax(hit, axis=-1)], np.inf)
-        collision = (60.0 / (0.3 + first)).max(axis=0)
+        collision = (60.0 / (0.3 + first)).sum(axis=0)
+        close = np.where((gap_along < 0.0) & (gap_across < 1.0), 1.0 - np.maximum(gap_across, 0.0), 0.0)
+        collision += 8.0 * close.max(axis=-1).sum(axis=0)
         # Before something that stands in the way, keep the room to swing out
         room = np.where((gap_across < 0.3) & ~behind, np.maximum(7.0 - gap_along, 0.0), 0.0)
         return collision + 1.5 * room.max(axis=-1).sum(axis=0)

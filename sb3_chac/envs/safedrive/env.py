@@ -101,7 +101,7 @@ class SafeDriveEnv(gym.Env):
         start_scenario: int = 100,
         num_scenarios: int = 20,
         traffic_density: float = 0.6,
-        obstacle_density: float = 0.35,
+        obstacle_density: float = 0.25,
         blocks: int | str = 4,
         horizon: int = 1000,
         displacement_reward: float = 1.0,
@@ -290,8 +290,9 @@ class SafeDriveEnv(gym.Env):
 
     def _observe(self) -> np.ndarray:
         ego, route = self.ego, self.map.route
+        distances, self.seen = self.scan()
         observation = np.empty(N_EGO + N_NAVIGATION + self.lidar.rays, np.float32)
-        off_lane = self.lateral - LANES[self.lateral > 0]
+        off_lane = self.lateral - LANES[int(self.lateral > 0)]
         observation[:N_EGO] = (
             self.lateral / HALF_WIDTH, -self.lateral / HALF_WIDTH, np.tanh(self.heading_error / 0.15),
             2 * ego.speed / MAX_SPEED - 1, np.tanh(ego.steering / 0.15), *self.last_action,
@@ -302,12 +303,12 @@ class SafeDriveEnv(gym.Env):
         bearing = wrap_angle(np.arctan2(d[:, 1], d[:, 0]) - ego.heading)
         observation[N_EGO : N_EGO + N_NAVIGATION : 2] = np.tanh(bearing / 0.4)
         observation[N_EGO + 1 : N_EGO + N_NAVIGATION : 2] = np.tanh(wrap_angle(points[:, 2] - ego.heading) / 0.6)
-        observation[N_EGO + N_NAVIGATION :] = 1 - self.scan() / self.lidar.reach
+        observation[N_EGO + N_NAVIGATION :] = 1 - distances / self.lidar.reach
         return np.clip(observation, -1.0, 1.0)
 
-    def scan(self) -> np.ndarray:
+    def scan(self) -> tuple[np.ndarray, np.ndarray]:
         """
-        :return: [m] distances along the lidar's rays, shape (240,)
+        :return: [m] distances along the lidar's rays, shape (240,), and indices of the boxes that can be seen
         """
         return self.lidar.scan(
             self.ego.position, self.ego.heading, self.box_positions, self.box_headings, self.box_lengths, self.box_widths

@@ -24,18 +24,19 @@ class Lidar:
         headings: np.ndarray,
         lengths: np.ndarray,
         widths: np.ndarray,
-    ) -> np.ndarray:
+    ) -> tuple[np.ndarray, np.ndarray]:
         """
         Slab method: a ray is inside a box while it is between both pairs of its parallel sides.
 
         :param position: of the lidar, shape (2,); ``heading`` is where ray 0 looks
         :param positions: centres of the boxes, shape (n, 2), with ``headings``, ``lengths`` and ``widths``, shape (n,)
-        :return: [m] distances, ``reach`` where there is nothing, shape (rays,)
+        :return: [m] distances, ``reach`` where there is nothing, and indices of the boxes that can be seen; shapes (rays,), (m,)
         """
         d = position - positions
         near = d[:, 0] ** 2 + d[:, 1] ** 2 < (self.reach + 3.0) ** 2
-        if not near.any():
-            return np.full(self.rays, self.reach)
+        near = np.flatnonzero(near)
+        if len(near) == 0:
+            return np.full(self.rays, self.reach), near
         d, headings, half_length, half_width = d[near], headings[near], lengths[near, None] / 2, widths[near, None] / 2
         # Origin and directions of the rays in the frame of each box: (n, 1) and (n, rays)
         cos, sin = np.cos(headings), np.sin(headings)
@@ -50,4 +51,6 @@ class Lidar:
         enters = np.maximum(middle_x - reach_x, middle_y - reach_y)
         leaves = np.minimum(middle_x + reach_x, middle_y + reach_y)
         hits = (leaves >= enters) & (leaves > 0)
-        return np.where(hits, np.maximum(enters, 0.0), self.reach).min(axis=0, initial=self.reach)
+        distances = np.where(hits, np.maximum(enters, 0.0), np.inf)
+        nearest = distances.min(axis=0, initial=self.reach)
+        return nearest, near[(distances <= nearest).any(axis=1)]

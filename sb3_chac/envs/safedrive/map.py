@@ -268,7 +268,7 @@ class Map:
     def _scene(rng: np.random.Generator, s: float) -> list[Obstacle]:
         lane, kind = rng.choice(LANES), rng.choice(["cones", "triangle", "breakdown"])
         if kind == "cones":
-            return [Obstacle("cone", s + 4.0 * i, lane + rng.uniform(-0.6, 0.6)) for i in range(3)]
+            return [Obstacle("cone", s + 3.0 * i, lane + rng.uniform(-0.5, 0.5)) for i in range(5)]
         warning = Obstacle("triangle", s, lane + rng.uniform(-0.6, 0.6))
         return [warning] if kind == "triangle" else [warning, Obstacle("parked", s + 12.0, lane + rng.uniform(-0.3, 0.3))]
 

@@ -202,7 +202,7 @@ class Viewer:
 
     def _paint_lidar(self) -> None:
         env, draw = self.env, self.pygame.draw
-        distances = env.scan()
+        distances = env.scan()[0]
         angles = env.ego.heading + np.arange(env.lidar.rays) * 2 * np.pi / env.lidar.rays
         hits = env.ego.position + distances[:, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)
         start = self._to_canvas(env.ego.position)

@@ -15,7 +15,7 @@ HIDDEN, DRIVING, CRASHED, GONE = range(4)  # states of a car
 
 MAX_ACCELERATION, COMFORTABLE_BRAKING, MAX_BRAKING = 3.0, 4.0, 6.0  # [m/s2]
 MIN_GAP, TIME_GAP = 3.0, 1.0  # [m], [s]
-SPEEDS = 6.0, 10.0  # [m/s] between which cars want to drive
+SPEEDS = 8.0, 11.0  # [m/s] between which cars want to drive
 LANE_CHANGE_SPEED = 1.5  # [m/s] sideways
 AHEAD = 2.0 + 2.0 * np.arange(12)  # [m] before the bumper, where a car looks for others on its path
 SOON = 0.35 * np.arange(1, 9)  # [s] at which it compares where everybody will be
