@@ -6,8 +6,8 @@
     python benchmarks/safedrive.py learn --jobs 2   # SAC, 100K steps, 3 seeds; runs what is missing
     python benchmarks/safedrive.py report     # table and curves of what was learned
 
-CSVs are written to benchmarks/results/safedrive/. Maps: 100-119 to learn on, 1000-1049 to test what was learned, 300000-300199 for the drivers
-(none of them was used while tuning; that was done on 2000-2099, 5000-5099 and 7000-7099).
+CSVs are written to benchmarks/results/safedrive/. Maps: 100-119 to learn on, 1000-1049 to test what was learned,
+300000-300199 for the drivers (none of these was used while tuning; that was done on 2000-2099, 5000-5059 and 7000-7199).
 """
 
 import argparse
@@ -162,7 +162,7 @@ def speed(args: argparse.Namespace) -> None:
 
 
 def traffic(args: argparse.Namespace) -> None:
-    """Overlapping pairs of cars (each pair once), and cars that were towed away because they stood for 15 s, per episode of the scripted driver."""
+    """Pairs of cars that overlap, and cars that stood for 15 s and were towed away, while the scripted driver drives."""
     rows = []
     for density in (0.6, 1.0, 2.0):
         env = gym.make("SafeDrive-v0", traffic_density=density).unwrapped

@@ -164,9 +164,8 @@ class ScriptedDriver:
         positions = np.concatenate([positions, np.repeat(env.box_positions[static, None], len(times), axis=1)])
         headings = np.concatenate([headings, np.repeat(env.box_headings[static, None], len(times), axis=1)])
         ahead, laterals = self._along_route(env.box_positions[near], env.box_headings[near])
-        return Others(
-            positions, headings, env.box_lengths[near, None], env.box_widths[near, None], np.arange(len(near)) < n_cars, ahead, laterals
-        )  # fmt: skip
+        lengths, widths = env.box_lengths[near, None], env.box_widths[near, None]
+        return Others(positions, headings, lengths, widths, np.arange(len(near)) < n_cars, ahead, laterals)
 
     def _along_route(self, positions: np.ndarray, headings: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """
@@ -174,7 +173,7 @@ class ScriptedDriver:
         :return: [m] how far ahead of the ego along its route, inf for who does not go along, and how far to the right of the
             route; shapes (n,)
         """
-        first = int(self.env.s / SPACING)
+        first = max(int(self.env.s / SPACING), 0)
         route = self.env.map.route[first : first + int(SIGHT / SPACING) : 2]
         d = positions[:, None] - route[:, :2]
         nearest = np.argmin(d[..., 0] ** 2 + d[..., 1] ** 2, axis=1)
@@ -212,7 +211,8 @@ class ScriptedDriver:
         headings = headings + np.sign(to_go)[:, None, None] * changing * min(slope, LATERAL_SPEED / max(ego.speed, 4.0))
 
         cost = -way[:, -1] + 0.15 * np.abs(ACCELERATIONS) + 4.0 * np.maximum(speeds[:, -1] - cap, 0.0)
-        here = LANES[int(env.lateral + 10.0 * np.sin(env.heading_error) > 0)]  # where it is about to be: who has begun, goes on
+        # Who has begun to change lanes goes on
+        here = LANES[int(env.lateral + 10.0 * np.sin(env.heading_error) > 0)]
         cost = cost + LANE_CHANGE_COST * (TARGETS != here)[:, None] + self._collision_cost(others, positions, headings)
         # See to it early to be in a free lane
         cost += EARLY_COST * np.maximum(1 - gaps / EARLY, 0.0)[:, None]

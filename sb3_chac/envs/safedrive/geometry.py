@@ -93,7 +93,7 @@ def wrap_angle(angle):
 
 def half_extents(length, width, angle):
     """
-    :return: half the extents along and across the axes of a box of ``length`` x ``width`` rotated by ``angle``
+    :return: half of what a box of ``length`` x ``width``, rotated by ``angle``, extends along and across the axes
     """
     cos, sin = np.abs(np.cos(angle)), np.abs(np.sin(angle))
     return (length * cos + width * sin) / 2, (length * sin + width * cos) / 2
@@ -104,7 +104,7 @@ def boxes_overlap(
     lengths: np.ndarray | float, widths: np.ndarray | float,
 ) -> np.ndarray:  # fmt: skip
     """
-    Rectangles overlap unless one of their four axes separates them (separating axis theorem). One box or many, by broadcasting.
+    Rectangles overlap unless one of their four axes separates them (separating axis theorem). Arguments broadcast.
 
     :param position: centres, shape (..., 2)
     :return: whether the boxes overlap, shape (...)

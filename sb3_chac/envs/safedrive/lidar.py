@@ -30,11 +30,10 @@ class Lidar:
 
         :param position: of the lidar, shape (2,); ``heading`` is where ray 0 looks
         :param positions: centres of the boxes, shape (n, 2), with ``headings``, ``lengths`` and ``widths``, shape (n,)
-        :return: [m] distances, ``reach`` where there is nothing, and indices of the boxes that can be seen; shapes (rays,), (m,)
+        :return: [m] distances, ``reach`` where there is nothing, shape (rays,), and indices of the boxes that can be seen
         """
         d = position - positions
-        near = d[:, 0] ** 2 + d[:, 1] ** 2 < (self.reach + 3.0) ** 2
-        near = np.flatnonzero(near)
+        near = np.flatnonzero(d[:, 0] ** 2 + d[:, 1] ** 2 < (self.reach + 3.0) ** 2)
         if len(near) == 0:
             return np.full(self.rays, self.reach), near
         d, headings, half_length, half_width = d[near], headings[near], lengths[near, None] / 2, widths[near, None] / 2

@@ -223,7 +223,7 @@ class Traffic:
     def _would_hit(self, path, s, lateral, positions, headings) -> np.ndarray | None:
         """
         :param positions: of the cars before their move, and of the ego
-        :return: cars that must not move, because they would touch another one that they do not touch yet; None if none are near
+        :return: cars that must not move, as they would touch another one that they do not touch yet; None if none are near
         """
         n = len(s)
         moved, moved_headings = self.poses(path, s, lateral)

@@ -21,6 +21,7 @@ class Ego(Vehicle):
     """
 
     MAX_SPEED = MAX_SPEED
+    speed: float  # [m/s]
 
     def __init__(self, pose: Pose) -> None:
         super().__init__(None, pose[:2], pose.heading, speed=0.0)  # without a road
