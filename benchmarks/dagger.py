@@ -83,7 +83,7 @@ def main() -> None:
         epochs = 5 * args.epochs if last else args.epochs
         for epoch in range(epochs):
             for group in optimizer.param_groups:
-                group["lr"] = 1e-3 * (1 - epoch / epochs if last else 1)
+                group["lr"] = 1e-3 * (1 - epoch / epochs)
             for batch in th.randperm(len(data_x)).split(256):
                 loss = nn.functional.mse_loss(net(tensors[0][batch]), tensors[1][batch])
                 optimizer.zero_grad()

@@ -80,7 +80,7 @@ def risky(times, **kwargs):
         ("LLHHLLLL", dict(delay=1, hold=1, safe=2), "01100111"),  # after a takeover, the delay counts anew
         ("LHHLHHH", dict(delay=0, hold=2, safe=1), "1101100"),  # and so do the held steps
         ("LHHLHHH", dict(delay=0, hold=1, safe=2), "1101100"),  # and the safe ones
-        ("LLLLLHHHHHHHHHHH", dict(), "0001111111111000"),  # the defaults: steps 3 to 12 are held
+        ("LLLLLHHHHHHHHHHH", dict(), "0111111111100000"),  # the defaults: steps 1 to 10 are held
     ],
 )
 def test_risk_rule_steps(times, kwargs, expected):
@@ -101,7 +101,7 @@ def test_risk_rule_smooths_the_action():
 
 def test_risk_by_name_uses_the_experts_predictor():
     env = armed("risk", "scripted", DrivenIntegrator())
-    assert drive(env, 5) == bits("00011")  # the novice's x is positive
+    assert drive(env, 5) == bits("01111")  # the novice's x is positive
     with pytest.raises(ValueError, match=r"time_to_trouble.*RiskRule\(time_to_trouble=\.\.\.\)"):
         armed("risk", "scripted-ideal", DrivenIntegrator())
 

@@ -304,7 +304,7 @@ def test_determinism(late):
             observations.append(observation)
             if done:
                 env.reset()
-        assert env.human_steps == 21
+        assert env.human_steps == 27
         return np.array(observations)
 
     np.testing.assert_array_equal(rollout(1), rollout(1))

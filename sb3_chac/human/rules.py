@@ -37,7 +37,7 @@ class RiskRule:
 
     What the novice does is smoothed, ``m <- smoothing m + (1 - smoothing) a``, and the predictor says after how many seconds
     it would end badly. Two thresholds (hysteresis) and the three counts below keep the takeovers from flickering. With the
-    defaults, trouble in steps 0 to 3 leads to a takeover from step 3 on, which lasts ten steps at least.
+    defaults, trouble in steps 0 and 1 leads to a takeover from step 1 on, which lasts ten steps at least.
 
     :param time_to_trouble: (observation, action) -> time in seconds until trouble if ``action`` were held, inf for none
     :param take_over_below: predicted time, in seconds, below which the human wants to take over
@@ -54,7 +54,7 @@ class RiskRule:
         time_to_trouble: Callable[[Any, np.ndarray], float],
         take_over_below: float = 1.2,
         hand_back_above: float = 2.0,
-        delay: int = 3,
+        delay: int = 1,
         hold: int = 10,
         safe: int = 5,
         smoothing: float = 0.5,

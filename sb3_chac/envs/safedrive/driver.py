@@ -24,6 +24,7 @@ TARGETS = np.array(LANES)  # [m] the driver keeps to one lane or the other
 ACCELERATIONS = np.array([-4.0, -2.5, -1.2, 0.0, 1.2, 2.5])  # [m/s2]
 TIMES = 0.3 * np.arange(1, 13)  # [s] of the prediction
 FEARED = 0.125 * np.arange(1, 21)  # [s] of the prediction of what the novice does
+COUNTER_STEERING = 5.0  # [m/s2] with which a vehicle is straightened out
 STALLED_FOR = 3.0  # [s]
 IMPERFECTIONS = {
     "scripted": dict(reaction_delay=3, action_noise=0.1),
@@ -111,7 +112,11 @@ class ScriptedDriver:
         states = self._roll_out(float(action[0]) * MAX_STEERING, float(action[1]) * MAX_ACCELERATION)
         s, lateral, error, speed = states.T
         off_road = (np.abs(lateral) > HALF_WIDTH - 0.3) | (np.abs(error) > 0.9)
-        time = FEARED[np.argmax(off_road)] if off_road.any() else np.inf
+        time = np.inf
+        if off_road.any():  # too late once there is no time left to straighten out
+            first = int(np.argmax(off_road))
+            straighten = 0.2 + abs(error[first]) * speed[first] / COUNTER_STEERING
+            time = max(0.0, FEARED[first] - straighten)
         others = self._look(FEARED)
         if len(others.ahead):
             positions, headings = env.traffic.poses(np.zeros(len(s), dtype=int), s, lateral)
@@ -183,12 +188,12 @@ class ScriptedDriver:
         return np.where(along & (nearest > 0), nearest * 2 * SPACING, np.inf), lateral
 
     def _speed_cap(self) -> float:
-        """[m/s] with which the ego can take the curves ahead, braking comfortably before them"""
+        """[m/s] with which the ego can take the curves ahead, braking comfortably before them, and less if it heads off the road"""
         env = self.env
         ahead = np.arange(0.0, 30.0, 2 * SPACING)
         curvature = np.abs(env.map.route[np.minimum(((env.s + ahead) / SPACING).astype(int), len(env.map.route) - 1), 3])
         squares = LATERAL_ACCELERATION / np.maximum(curvature, 1e-3) + 2 * 1.5 * np.maximum(ahead - 2.0, 0.0)
-        return float(min(self.desired_speed, np.sqrt(squares.min())))
+        return float(min(self.desired_speed, np.sqrt(squares.min()))) / (1 + 4 * max(abs(env.heading_error) - 0.3, 0.0))
 
     def _plan(self, others: Others) -> tuple[float, float, float, float]:
         """
