@@ -13,7 +13,7 @@ def run(*command: str | Path, cwd: Path, env: dict[str, str] | None = None, fail
     """
     inherited = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "VIRTUAL_ENV")}
     completed = subprocess.run(
-        [str(part) for part in command], cwd=cwd, env={**inherited, **(env or {})}, capture_output=True, text=True
+        [str(part) for part in command], cwd=cwd, env={**inherited, **(env or {})}, capture_output=True, text=True, timeout=900
     )
     output = completed.stdout + completed.stderr
     assert (completed.returncode != 0) == fails, output

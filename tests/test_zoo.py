@@ -34,6 +34,19 @@ def test_train_leaves_what_the_zoo_promises(trained):
     assert dict(saved)["learning_rate"] == 0.001  # ours, not the zoo's default
 
 
+@pytest.mark.parametrize("algo", ["dsac", "sac", "ppo"])
+def test_our_environment(tmp_path, algo):
+    few = ["-params", "n_steps:64", "batch_size:64"] if algo == "ppo" else []
+    quick = ["--env", "SafeDrive-v0", "-n", "200", "--eval-freq", "100", "--eval-episodes", "1", "-f", "logs"]
+    output = run(ZOO, "train", "--algo", algo, *quick, *few, "--env-kwargs", "horizon:60", "blocks:2", cwd=tmp_path)
+    assert str(hyperparams_file(algo)) in output and "Saving to" in output
+    run_folder = tmp_path / "logs" / algo / "SafeDrive-v0_1"
+    output = run(
+        sys.executable, "-m", "sb3_chac", "evaluate", run_folder / "SafeDrive-v0.zip", "--scenarios", "1000:1002", cwd=tmp_path
+    )
+    assert "safety cost" in output
+
+
 def test_enjoy(trained):
     output = run(ZOO, "enjoy", "--algo", "dsac", "--env", "Pendulum-v1", "-f", "logs", "--no-render", "-n", "400", cwd=trained)
     assert "Mean reward:" in output and "2 Episodes" in output

@@ -1,5 +1,6 @@
 """What RL-Zoo3 has to be told of our algorithms, and gymnasium of our environments."""
 
+import contextlib
 import functools
 import importlib
 import inspect
@@ -15,9 +16,9 @@ ALGORITHMS = {"dsac": "DSAC"}
 
 def hyperparams_file(algo: str) -> Path:
     """
-    :param algo: name on RL-Zoo3's command line, e.g. "dsac"
+    :param algo: name on RL-Zoo3's command line, e.g. "dsac", or "sac" for SB3's algorithms on our environments
     :return: our default hyperparameters: inside an installed package, beside it in a checkout (editable install)
-    :raises FileNotFoundError: if there is none
+    :raises FileNotFoundError: if there are none
     """
     package = Path(sb3_chac.__file__).parent
     for folder in (package, package.parent):
@@ -56,6 +57,7 @@ def add_experiments(exp_manager: ModuleType) -> None:
     """
     :param exp_manager: ``rl_zoo3.exp_manager``
     """
+    from sb3_chac.envs import ENVIRONMENTS
     from sb3_chac.zoo.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 
     exp_manager.HYPERPARAMS_SAMPLER.update(HYPERPARAMS_SAMPLER)
@@ -69,8 +71,9 @@ def add_experiments(exp_manager: ModuleType) -> None:
     @functools.wraps(original)
     def with_our_hyperparams(*args: Any, **kwargs: Any) -> None:
         arguments = signature.bind(*args, **kwargs).arguments
-        if arguments["algo"] in ALGORITHMS and not arguments.get("config"):
-            arguments["config"] = str(hyperparams_file(arguments["algo"]))
+        if not arguments.get("config") and (arguments["algo"] in ALGORITHMS or arguments["env_id"] in ENVIRONMENTS):
+            with contextlib.suppress(FileNotFoundError):  # then it says itself that it has none either
+                arguments["config"] = str(hyperparams_file(arguments["algo"]))
         original(**arguments)
 
     exp_manager.ExperimentManager.__init__ = with_our_hyperparams
