@@ -3,6 +3,7 @@
     python benchmarks/safedrive.py drivers    # scripted drivers, a blind lane follower and random actions on 200 maps
     python benchmarks/safedrive.py speed      # steps per CPU second, and memory over 1,000 episodes
     python benchmarks/safedrive.py traffic    # overlaps and standstills among the traffic
+    python benchmarks/safedrive.py takeovers  # the human's stand-in beside novices of several kinds
     python benchmarks/safedrive.py learn --jobs 2   # SAC, 100K steps, 3 seeds; runs what is missing
     python benchmarks/safedrive.py report     # table and curves of what was learned
 
@@ -27,8 +28,10 @@ from stable_baselines3.common.callbacks import BaseCallback, EveryNTimesteps
 
 import sb3_chac.envs  # noqa: F401
 from sb3_chac.common.evaluation import evaluate
+from sb3_chac.envs.safedrive.driver import ScriptedDriver
 from sb3_chac.envs.safedrive.geometry import boxes_overlap
 from sb3_chac.envs.safedrive.traffic import CAR_LENGTH, CAR_WIDTH
+from sb3_chac.human import InterventionWrapper
 
 RESULTS = Path(__file__).parent / "results" / "safedrive"
 VERSIONS = " ".join(
@@ -62,6 +65,17 @@ class BlindFollower:
     def __call__(self, observation):
         error = self.driver._speed_cap() - self.env.ego.speed
         return np.clip([self.driver._steering(self.lane, 0.28), error], -1, 1)
+
+
+class ConstantDriver:
+    def __init__(self, action):
+        self.action = action
+
+    def reset(self, seed=None):
+        pass
+
+    def __call__(self, observation):
+        return self.action
 
 
 class RandomDriver:
@@ -189,6 +203,43 @@ def traffic(args: argparse.Namespace) -> None:
     write("traffic.csv", rows)
 
 
+def takeovers(args: argparse.Namespace) -> None:
+    """The default human (scripted driver, risk rule) beside novices from good to bad."""
+    env = InterventionWrapper(gym.make("SafeDrive-v0"))
+    raw = env.unwrapped
+    novices = {
+        "scripted-ideal": raw.scripted_driver("scripted-ideal"),
+        "scripted": raw.scripted_driver("scripted"),
+        "noise 0.6": ScriptedDriver(raw, reaction_delay=0, action_noise=0.6),
+        "straight on": ConstantDriver(np.array([0.0, 0.5])),
+        "random": RandomDriver(raw),
+    }
+    rows = []
+    for name, novice in novices.items():
+        for armed in (False, True):
+            (env.arm if armed else env.disarm)()
+            for scenario in range(300_000, 300_050):
+                observation, _ = env.reset(seed=scenario, options={"scenario": scenario})
+                novice.reset(scenario)
+                done, human, starts, human_cost = False, 0, 0, 0.0
+                while not done:
+                    action = np.asarray(novice(observation), np.float32)
+                    observation, _, terminated, truncated, info = env.step(action)
+                    done = terminated or truncated
+                    human, starts = human + info["takeover"], starts + info["takeover_start"]
+                    human_cost += info["cost"] * info["takeover"]
+                row = {"novice": name, "armed": int(armed), "scenario": scenario, "steps": raw.steps, "human_steps": human}
+                row |= {"takeovers": starts, "cost": int(info["episode_cost"]), "cost_while_human": int(human_cost)}
+                rows.append({**row, "success": int(info["is_success"]), "out_of_road": int(info["out_of_road"])})
+            here = rows[-50:]
+            mean = {
+                key: round(float(np.mean([row[key] for row in here])), 2) for key in ("success", "cost", "cost_while_human")
+            }
+            share = sum(row["human_steps"] for row in here) / sum(row["steps"] for row in here)
+            print(f"{name:15s}{'armed' if armed else 'alone'}  takeover share {share:.3f}", mean, flush=True)
+    write("takeovers.csv", rows)
+
+
 class Evaluate(BaseCallback):
     """Append one row to the CSV each time it is called."""
 
@@ -261,7 +312,7 @@ def report(args: argparse.Namespace) -> None:
 
 
 if __name__ == "__main__":
-    commands = {"drivers": drivers, "speed": speed, "traffic": traffic, "learn": learn, "report": report}
+    commands = {f.__name__: f for f in (drivers, speed, traffic, takeovers, learn, report)}
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("command", choices=commands)
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])

@@ -188,7 +188,7 @@ class ScriptedDriver:
         return np.where(along & (nearest > 0), nearest * 2 * SPACING, np.inf), lateral
 
     def _speed_cap(self) -> float:
-        """[m/s] with which the ego can take the curves ahead, braking comfortably before them, and less if it heads off the road"""
+        """[m/s] with which the ego can take the curves ahead after comfortable braking, and less if it heads off the road"""
         env = self.env
         ahead = np.arange(0.0, 30.0, 2 * SPACING)
         curvature = np.abs(env.map.route[np.minimum(((env.s + ahead) / SPACING).astype(int), len(env.map.route) - 1), 3])

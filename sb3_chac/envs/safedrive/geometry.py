@@ -100,11 +100,17 @@ def half_extents(length, width, angle):
 
 
 def boxes_overlap(
-    position: np.ndarray, heading: np.ndarray | float, length: float, width: float, positions: np.ndarray, headings: np.ndarray,
-    lengths: np.ndarray | float, widths: np.ndarray | float,
-) -> np.ndarray:  # fmt: skip
+    position: np.ndarray,
+    heading: np.ndarray | float,
+    length: float,
+    width: float,
+    positions: np.ndarray,
+    headings: np.ndarray,
+    lengths: np.ndarray | float,
+    widths: np.ndarray | float,
+) -> np.ndarray:
     """
-    Rectangles overlap unless one of their four axes separates them (separating axis theorem). Arguments broadcast.
+    Rectangles overlap unless one of their four axes separates them (separating axis theorem).
 
     :param position: centres, shape (..., 2)
     :return: whether the boxes overlap, shape (...)
