@@ -8,7 +8,7 @@
     python benchmarks/safedrive.py report     # table and curves of what was learned
 
 CSVs are written to benchmarks/results/safedrive/. Maps: 100-119 to learn on, 1000-1049 to test what was learned,
-300000-300199 for the drivers (none of these was used while tuning; that was done on 2000-2099, 5000-5059 and 7000-7199).
+400000-400199 for the drivers. None of these was used while tuning; that was done on maps from 2000, 5000, 7000 and 300000.
 """
 
 import argparse
@@ -38,7 +38,7 @@ VERSIONS = " ".join(
     f"{name}={importlib.metadata.version(name)}"
     for name in ("torch", "stable-baselines3", "gymnasium", "highway-env", "numpy")
 )
-DRIVER_MAPS = range(300_000, 300_200)
+DRIVER_MAPS = range(400_000, 400_200)
 TEST_MAPS = range(1000, 1050)
 LEARN_STEPS, LEARN_EVERY = 100_000, 10_000
 
@@ -181,7 +181,7 @@ def traffic(args: argparse.Namespace) -> None:
     for density in (0.6, 1.0, 2.0):
         env = gym.make("SafeDrive-v0", traffic_density=density).unwrapped
         driver = env.scripted_driver("scripted")
-        for scenario in range(300_000, 300_100):
+        for scenario in range(400_000, 400_100):
             env.reset(options={"scenario": scenario})
             driver.reset(scenario)
             pairs, done, most, longest = set(), False, 0, 0.0
@@ -218,7 +218,7 @@ def takeovers(args: argparse.Namespace) -> None:
     for name, novice in novices.items():
         for armed in (False, True):
             (env.arm if armed else env.disarm)()
-            for scenario in range(300_000, 300_050):
+            for scenario in range(400_000, 400_050):
                 observation, _ = env.reset(seed=scenario, options={"scenario": scenario})
                 novice.reset(scenario)
                 done, human, starts, human_cost = False, 0, 0, 0.0

@@ -25,7 +25,7 @@ ACCELERATIONS = np.array([-4.0, -2.5, -1.2, 0.0, 1.2, 2.5])  # [m/s2]
 TIMES = 0.3 * np.arange(1, 13)  # [s] of the prediction
 FEARED = 0.125 * np.arange(1, 21)  # [s] of the prediction of what the novice does
 COUNTER_STEERING = 5.0  # [m/s2] with which a vehicle is straightened out
-STALLED_FOR = 3.0  # [s]
+STALLED_FOR, BOXED_IN_FOR = 3.0, 8.0  # [s]
 IMPERFECTIONS = {
     "scripted": dict(reaction_delay=3, action_noise=0.1),
     "scripted-ideal": dict(reaction_delay=0, action_noise=0.0),
@@ -206,7 +206,8 @@ class ScriptedDriver:
         before = np.concatenate([np.full((len(ACCELERATIONS), 1), ego.speed), speeds[:, :-1]], axis=1)
         way = np.cumsum((before + speeds) / 2, axis=1) * TIMES[0]
         gaps = np.array([others.ahead[np.abs(others.laterals - target) < 2.0].min(initial=EARLY) for target in TARGETS])
-        slope = float(np.clip(LANE_WIDTH / max(gaps[int(env.lateral > 0)] - 13.0, 1.0), GENTLE_SLOPE, STEEP_SLOPE))
+        steepest = STEEP_SLOPE + 0.25 * max(0.0, 1.0 - ego.speed / 4.0)  # who is slow can turn more sharply
+        slope = float(np.clip(LANE_WIDTH / max(gaps[int(env.lateral > 0)] - 13.0, 1.0), GENTLE_SLOPE, steepest))
         to_go = TARGETS - env.lateral
         moved = np.minimum(np.abs(to_go)[:, None, None], np.minimum(slope * way, LATERAL_SPEED * TIMES))
         lateral = env.lateral + np.sign(to_go)[:, None, None] * moved
@@ -246,15 +247,15 @@ class ScriptedDriver:
         behind = along > ego.LENGTH / 2 + half_length
         stays = (np.abs(TARGETS - self.env.lateral) < 2.0)[:, None, None]
         hit &= ~(behind & moves & (np.abs(angle) < 0.3) & stays)  # who follows keeps the distance
-        if self.boxed_in > 8.0:
-            hit &= moves  # nothing else helps: push through
+        if self.boxed_in > BOXED_IN_FOR:  # nothing else helps: push through
+            hit &= moves
         first = np.where(hit.any(axis=-1), TIMES[np.argmax(hit, axis=-1)], np.inf)
         collision = (60.0 / (0.3 + first)).sum(axis=0)
         close = np.where((gap_along < 0.0) & (gap_across < 1.0), 1.0 - np.maximum(gap_across, 0.0), 0.0)
         collision += 8.0 * close.max(axis=-1).sum(axis=0)
         # Before something that stands in the way, keep the room to swing out
         room = np.where((gap_across < 0.3) & ~behind, np.maximum(7.0 - gap_along, 0.0), 0.0)
-        return collision + 1.5 * room.max(axis=-1).sum(axis=0)
+        return collision + 1.5 * (self.boxed_in < BOXED_IN_FOR) * room.max(axis=-1).sum(axis=0)
 
     def _steering(self, target: float, slope: float) -> float:
         """Pure pursuit of a lateral target [m], approached with a slope; in [-1, 1]"""
