@@ -64,7 +64,7 @@ def main() -> None:
     net = nn.Sequential(
         nn.Linear(env.observation_space.shape[0], 256), nn.ReLU(), nn.Linear(256, 256), nn.ReLU(), nn.Linear(256, 2), nn.Tanh()
     )
-    optimizer = th.optim.AdamW(net.parameters(), lr=1e-3, weight_decay=0.01)
+    optimizer = th.optim.Adam(net.parameters(), lr=1e-3)
 
     def policy(observation):
         with th.no_grad():
@@ -85,7 +85,7 @@ def main() -> None:
             for group in optimizer.param_groups:
                 group["lr"] = 1e-3 * (1 - epoch / epochs)
             for batch in th.randperm(len(data_x)).split(256):
-                loss = nn.functional.smooth_l1_loss(net(tensors[0][batch]), tensors[1][batch], beta=0.1)
+                loss = nn.functional.mse_loss(net(tensors[0][batch]), tensors[1][batch])
                 optimizer.zero_grad()
                 loss.backward()
                 optimizer.step()
