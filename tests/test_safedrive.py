@@ -325,16 +325,41 @@ def test_too_crowded_a_layout_is_refused(monkeypatch):
         SafeDriveEnv(blocks="CC").reset(options={"scenario": 3})
 
 
-def test_paths_end_where_roads_end():
+def test_paths_share_the_route_where_they_say():
+    shared = set()
     for scenario in range(20):
         road_map = Map(scenario, 4, 1.0)
-        route_end = chain(road_map.paths[0].start, road_map.paths[0].segments)[-1]
         for path in road_map.paths:
-            end = chain(path.start, path.segments)[-1]
-            if path.kind == "merges":
-                assert np.hypot(end.x - route_end.x, end.y - route_end.y) == pytest.approx(2.0, abs=1e-6)
+            table = sample(path.start, path.segments)
+            s = np.arange(len(table)) * 0.5
+            on_route = (s >= path.shared[0]) & (s <= path.shared[1])
+            shared |= {path.kind} if on_route.any() else set()
+            if on_route.any():
+                index = np.round((s[on_route] + path.ahead_of_route) / 0.5).astype(int).clip(0, len(road_map.route) - 1)
+                distance = np.linalg.norm(table[on_route, :2] - road_map.route[index, :2], axis=1)
+                assert distance.max() < 0.51  # the spacing of the samples
         opposing = chain(road_map.paths[1].start, road_map.paths[1].segments)[-1]
         assert np.hypot(*opposing.shifted(0, -10.0)[:2]) == pytest.approx(0.0, abs=1e-6)
+    assert shared == {"route", "side", "leaves", "merges"}
+
+
+def test_traffic_does_not_drive_through_obstacles():
+    env = SafeDriveEnv(traffic_density=1.5, obstacle_density=0.6)
+    touched = steps = 0
+    for scenario in range(3000, 3008):
+        env.reset(options={"scenario": scenario})
+        driver = env.scripted_driver("scripted-ideal")
+        for _ in range(300):
+            _, _, terminated, _, _ = env.step(driver())
+            n = len(env.traffic.visible)
+            boxes = (values[n:] for values in (env.box_positions, env.box_headings, env.box_lengths, env.box_widths))
+            boxes = list(boxes)
+            for position, heading in zip(env.traffic.positions, env.traffic.headings, strict=True):
+                touched += boxes_overlap(position, heading, CAR_LENGTH, CAR_WIDTH, *boxes).any()
+                steps += 1
+            if terminated:
+                break
+    assert steps > 1000 and touched < 0.005 * steps
 
 
 def test_obstacles_leave_a_lane_free():

@@ -26,7 +26,8 @@ RING_ANGLE = float(np.arcsin((AXIS + FILLET) / (RING + FILLET)))  # [rad] from a
 ROUNDABOUT = float(np.sqrt((RING + FILLET) ** 2 - (AXIS + FILLET) ** 2))  # [m] from its middle to where its roads begin
 BEHIND = np.pi  # [rad] direction of the arm by which the ego comes
 
-RAMP_RADIUS, RAMP_ANGLE = 40.0, 0.35
+RAMP_RADIUS, RAMP_ANGLE = 40.0, 0.35  # [m], [rad]
+RAMP_JOINT = 10.0  # [m] from the beginning of the block to where a ramp leaves, and from where one merges to its end
 _SHIFT = float(np.arccos(1 - LANE_WIDTH / (2 * RAMP_RADIUS)))  # [rad] of two opposite arcs that change by one lane
 ON_RAMP = [Segment(30.0), turn(RAMP_RADIUS, RAMP_ANGLE), Segment(15.0), turn(RAMP_RADIUS, -_SHIFT), turn(RAMP_RADIUS, _SHIFT)]
 OFF_RAMP = [turn(RAMP_RADIUS, _SHIFT), turn(RAMP_RADIUS, -_SHIFT), Segment(15.0), turn(RAMP_RADIUS, RAMP_ANGLE), Segment(30.0)]
@@ -43,6 +44,8 @@ class Path(NamedTuple):
     meets: float = 0.0  # [m] along the path, where it comes to the block that it belongs to
     block_start: float = 0.0  # [m] along the route, where that block begins
     lanes: tuple[float, ...] = LANES  # [m] offsets at which it may be driven
+    shared: tuple[float, float] = (np.inf, np.inf)  # [m] from where to where along the path it runs on the ego's route
+    ahead_of_route: float = 0.0  # [m] along the route less [m] along the path, where shared
 
 
 class Obstacle(NamedTuple):
@@ -128,9 +131,9 @@ def _ramp(start: Pose, rng: np.random.Generator) -> Block:
     block = _road("R", start, [Segment(85.0)])
     block.ramp_leaves = bool(rng.random() < 0.5)
     if block.ramp_leaves:
-        block.ramp = start.shifted(10.0, LANES[1]), OFF_RAMP
+        block.ramp = start.shifted(RAMP_JOINT, LANES[1]), OFF_RAMP
     else:  # laid backwards from where it merges
-        merge = block.end.shifted(-10.0, LANES[1], np.pi)
+        merge = block.end.shifted(-RAMP_JOINT, LANES[1], np.pi)
         start_of_ramp = chain(merge, [segment.reverse() for segment in reversed(ON_RAMP)])[-1]
         block.ramp = start_of_ramp.shifted(0.0, 0.0, -np.pi), ON_RAMP
     return block
@@ -175,7 +178,7 @@ class Map:
         segments = [segment for block in self.blocks for segment in block.route]
         self.length = length(segments) - RUN_OUT
         self.route = sample(self.start, segments)
-        self.paths = [Path("route", self.start, segments), *self._other_paths()]
+        self.paths = [Path("route", self.start, segments, shared=(0.0, np.inf)), *self._other_paths()]
         self.obstacles = self._place_obstacles(rng, obstacle_density)
 
     @staticmethod
@@ -219,32 +222,37 @@ class Map:
         paths = [Path("opposing", opposing_start, join(opposing[::-1]))]
         for i, block in enumerate(self.blocks):
             before, after, block_start = join(route[:i]), join(route[i + 1 :]), length(join(route[:i]))
-            if block.ramp:
-                start, ramp = block.ramp
+            block_end = block_start + length(block.route)
+            if block.ramp:  # one lane, as the right one of a carriageway
+                start, ramp = block.ramp[0].shifted(0.0, -LANES[1]), [segment.offset(-LANES[1]) for segment in block.ramp[1]]
+                straight, right = [Segment(RAMP_JOINT)], LANES[1:]
                 if block.ramp_leaves:
-                    right_lane = [segment.offset(LANES[1]) for segment in before] + [Segment(10.0)]
-                    on = self.start.shifted(0.0, LANES[1])
-                    paths.append(Path("leaves", on, right_lane + ramp, length(right_lane), block_start, (0.0,)))
+                    leaves = block_start + RAMP_JOINT
+                    paths.append(
+                        Path("leaves", self.start, before + straight + ramp, leaves, block_start, right, (0.0, leaves))
+                    )
                 else:
-                    right_lane = [Segment(10.0)] + [segment.offset(LANES[1]) for segment in after]
-                    paths.append(Path("merges", start, ramp + right_lane, length(ramp) - 12.0, block_start, (0.0,)))
+                    joins = length(ramp)
+                    shift = block_end - RAMP_JOINT - joins
+                    shared = (joins, np.inf)
+                    paths.append(
+                        Path("merges", start, ramp + straight + after, joins - 12.0, block_start, right, shared, shift)
+                    )
             for arm in block.side_arms:
                 start, lead = block.arm_start(arm), [Segment(ARM)]
-                ends = {block.exit_arm: after, BEHIND: join(opposing[:i][::-1])}
+                joining = lead + way(block.kind, arm, block.exit_arm)
+                joins, lanes = length(joining), _lanes(arm, block.exit_arm)
+                shared = (joins, np.inf)
+                paths.append(Path("side", start, joining + after, ARM, block_start, lanes, shared, block_end - joins))
+                ends = {BEHIND: join(opposing[:i][::-1]), **{to: lead for to in block.side_arms if to != arm}}
                 for to, rest in ends.items():
-                    paths.append(
-                        Path("side", start, lead + way(block.kind, arm, to) + rest, ARM, block_start, _lanes(arm, to))
-                    )
-                for to in set(block.side_arms) - {arm}:
-                    paths.append(
-                        Path("side", start, lead + way(block.kind, arm, to) + lead, ARM, block_start, _lanes(arm, to))
-                    )
-                turning = way(block.kind, BEHIND, arm) + lead
-                paths.append(Path("leaves", self.start, before + turning, block_start, block_start, _lanes(BEHIND, arm)))
-                coming = join(opposing[i + 1 :][::-1])
-                turning = way(block.kind, block.exit_arm, arm) + lead
-                lanes = _lanes(block.exit_arm, arm)
-                paths.append(Path("side", opposing_start, coming + turning, length(coming), block_start, lanes))
+                    segments = lead + way(block.kind, arm, to) + rest
+                    paths.append(Path("side", start, segments, ARM, block_start, _lanes(arm, to)))
+                segments, lanes = before + way(block.kind, BEHIND, arm) + lead, _lanes(BEHIND, arm)
+                paths.append(Path("leaves", self.start, segments, block_start, block_start, lanes, (0.0, block_start)))
+                coming, lanes = join(opposing[i + 1 :][::-1]), _lanes(block.exit_arm, arm)
+                segments = coming + way(block.kind, block.exit_arm, arm) + lead
+                paths.append(Path("side", opposing_start, segments, length(coming), block_start, lanes))
         return paths
 
     def _place_obstacles(self, rng: np.random.Generator, density: float) -> list[Obstacle]:

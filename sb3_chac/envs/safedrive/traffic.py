@@ -16,7 +16,7 @@ HIDDEN, DRIVING, CRASHED, GONE = range(4)  # states of a car
 MAX_ACCELERATION, COMFORTABLE_BRAKING, MAX_BRAKING = 3.0, 4.0, 6.0  # [m/s2]
 MIN_GAP, TIME_GAP = 3.0, 1.0  # [m], [s]
 SPEEDS = 8.0, 11.0  # [m/s] between which cars want to drive
-LANE_CHANGE_SPEED = 1.5  # [m/s] sideways
+LANE_CHANGE_SPEED = 2.0  # [m/s] sideways
 AHEAD = 2.0 + 2.0 * np.arange(12)  # [m] before the bumper, where a car looks for others on its path
 SOON = 0.35 * np.arange(1, 9)  # [s] at which it compares where everybody will be
 PATIENCE, TOWED_AFTER = 6.0, 15.0  # [s] of standing, after which a car stops yielding, and after which it is taken away
@@ -49,6 +49,9 @@ class Traffic:
         self.first, self.last = np.cumsum(sizes) - sizes, sizes - 1
         obstacles = [(o.s, o.lateral, OBSTACLE_SIZES[o.kind][0] / 2) for o in road_map.obstacles]
         self.obstacle_s, self.obstacle_lateral, self.obstacle_half = np.array(obstacles).reshape(-1, 3).T
+        in_use = [road_map.paths[index] for index in table_of]
+        self.shared_from, self.shared_to = np.array([path.shared for path in in_use]).T
+        self.ahead_of_route = np.array([path.ahead_of_route for path in in_use])
 
     def _draw(self, density: float, rng: np.random.Generator) -> list[tuple[int, float, float, float]]:
         """Path, place on it [m], lane [m] and the place of the ego on the route [m] from which on the car is there."""
@@ -153,34 +156,48 @@ class Traffic:
     def _appear(self, ego_s: float, ego_position: np.ndarray) -> None:
         """Cars whose time has come, unless there is somebody in their place."""
         for car in np.flatnonzero((self.state == HIDDEN) & (self.trigger <= ego_s)):
+            if self._stands_on_obstacle(car):
+                self.state[car] = GONE
+                continue
             position, _ = self.poses(self.path[car], self.s[car], self.lateral[car])
             others = np.concatenate([self.positions, ego_position[None]])
             if np.min(np.sum((others - position) ** 2, axis=1)) > 15.0**2:
                 self.state[car] = DRIVING
                 self.update_visible()
 
+    def _stands_on_obstacle(self, car: int) -> bool:
+        path, s = self.path[car], self.s[car]
+        if not self.shared_from[path] <= s <= self.shared_to[path]:
+            return False
+        beside = np.abs(self.obstacle_lateral - self.lateral[car]) < 2.5
+        return bool((beside & (np.abs(self.obstacle_s - s - self.ahead_of_route[path]) < 12.0)).any())
+
     def _pull_over(self, cars, path, s, lateral, speed) -> np.ndarray:
         """
         Cars on the ego's route pass obstacles in the other lane.
+
+        :param path: of all cars, then of the ego (the other arguments likewise); shape (n_cars + 1,)
 
         :return: [m] from each car's bumper to an obstacle in its lane, shape (n_cars,)
         """
         gap = np.full(len(cars), np.inf)
         if not self.obstacle_there.any():
             return gap
-        for i in np.flatnonzero(path[:-1] == 0):
+        on_route = (s >= self.shared_from[path] - 12.0) & (s <= self.shared_to[path])
+        s = s + self.ahead_of_route[path]
+        for i in np.flatnonzero(on_route[:-1]):
             ahead = self.obstacle_s - s[i]
-            near = self.obstacle_there & (ahead > -2.0) & (ahead < 25.0)
+            near = self.obstacle_there & (ahead > -6.0) & (ahead < 35.0)
             blocking = near & (np.abs(self.obstacle_lateral - self.target[cars[i]]) < 2.2)
             if blocking.any():
                 other = -self.target[cars[i]]
                 beside = (
-                    (path == 0) & (np.abs(lateral - other) < 2.5) & (np.abs(s - s[i] + np.maximum(speed - speed[i], 0)) < 10.0)
+                    on_route & (np.abs(lateral - other) < 2.5) & (np.abs(s - s[i] + np.maximum(speed - speed[i], 0)) < 10.0)
                 )
                 beside[i] = False
                 if not beside.any() and not (near & (np.abs(self.obstacle_lateral - other) < 2.2)).any():
                     self.target[cars[i]] = other
-            in_way = near & (ahead > 0) & (np.abs(self.obstacle_lateral - lateral[i]) < 2.0)
+            in_way = near & (ahead > 0) & (np.abs(self.obstacle_lateral - lateral[i]) < 2.3)
             gap[i] = np.min(np.where(in_way, ahead - CAR_LENGTH / 2 - self.obstacle_half, np.inf))
         return gap
 
