@@ -102,8 +102,11 @@ def test_obstacles_are_painted_where_they_are(kind):
 
 
 def test_traffic_and_wrecks_have_their_colours():
-    env = make(blocks="SS", until=0.4, traffic_density=3, obstacle_density=0)
-    car = int(env.traffic.visible[np.argmin(np.linalg.norm(env.traffic.positions - env.ego.position, axis=1))])
+    env = make(blocks="SS", until=0.3, traffic_density=3, obstacle_density=0)
+    driver = env.scripted_driver("scripted-ideal")
+    while not (near := np.linalg.norm(env.traffic.positions - env.ego.position, axis=1) < 35).any():
+        assert not any(env.step(driver())[2:4])
+    car = int(env.traffic.visible[near][0])
     for colour in (rendering.TRAFFIC, rendering.WRECK):
         frame = env.render()
         place = env._viewer.to_picture(env.box_positions[env.box_ids.index(("car", car))])
