@@ -16,6 +16,7 @@ from sb3_chac.envs.safedrive.map import (
     HALF_WIDTH,
     LANE_WIDTH,
     LANES,
+    RAMP_JOINT,
     RING,
     RING_ANGLE,
     Block,
@@ -102,7 +103,7 @@ def _split(block: Block) -> list[Segment]:
     if not block.ramp:
         return block.route
     whole = block.route[0].length
-    first = 10.0 if block.ramp_leaves else whole - 10.0
+    first = RAMP_JOINT if block.ramp_leaves else whole - RAMP_JOINT
     return [Segment(first), Segment(whole - first)]
 
 
