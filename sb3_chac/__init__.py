@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from sb3_chac.dsac import DSAC
+    from sb3_chac.human import InterventionWrapper
 
 __version__ = (Path(__file__).parent / "version.txt").read_text().strip()
 
 # Public name -> module that defines it
-_EXPORTS = {"DSAC": "sb3_chac.dsac"}
+_EXPORTS = {"DSAC": "sb3_chac.dsac", "InterventionWrapper": "sb3_chac.human"}
 
-__all__ = ["DSAC", "__version__"]
+__all__ = ["DSAC", "InterventionWrapper", "__version__"]
 
 
 def __getattr__(name: str) -> Any:

@@ -11,6 +11,7 @@ from highway_env.envs.common.observation import LidarObservation
 from highway_env.utils import are_polygons_intersecting, rect_corners
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from shell import run
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
 from sb3_chac.envs.safedrive import SafeDriveEnv
@@ -18,7 +19,7 @@ from sb3_chac.envs.safedrive.geometry import Pose, Segment, boxes_overlap, chain
 from sb3_chac.envs.safedrive.lidar import Lidar
 from sb3_chac.envs.safedrive.map import BLOCKS, Map
 from sb3_chac.envs.safedrive.traffic import CAR_LENGTH, CAR_WIDTH
-from tests.shell import run
+from sb3_chac.human import InterventionWrapper
 
 INFO_KEYS = {
     "cost", "collision", "contact", "out_of_road", "arrive_dest", "is_success", "route_completion", "speed", "episode_cost",
@@ -493,3 +494,50 @@ def test_time_to_trouble():
         driver = driver if driver.env is env else env.scripted_driver("scripted-ideal")
         driver()
     assert driver.time_to_trouble(None, straight) == 0  # it stands although it could go
+
+
+# The driver as the human's stand-in
+
+
+def test_default_human_keeps_a_random_novice_on_the_road():
+    env = InterventionWrapper(gym.make("SafeDrive-v0"))
+    rng = np.random.default_rng(0)
+
+    def departures(scenarios):
+        total = 0
+        for scenario in scenarios:
+            env.reset(seed=scenario, options={"scenario": scenario})
+            done = False
+            while not done:
+                *_, terminated, truncated, info = env.step(rng.uniform(-1, 1, 2).astype(np.float32))
+                done = terminated or truncated
+            total += info["out_of_road"]
+        return total
+
+    assert departures(range(2000, 2006)) == 6 and env.human_steps == 0
+    env.arm()
+    assert departures(range(2000, 2006)) <= 1 and 0.2 < env.takeover_rate < 0.8
+
+
+def test_default_human_leaves_a_good_driver_alone():
+    env = InterventionWrapper(gym.make("SafeDrive-v0"), armed=True)
+    for scenario in range(2000, 2006):
+        observation, info = env.reset(seed=scenario, options={"scenario": scenario})
+        novice = env.unwrapped.scripted_driver("scripted-ideal")
+        done = False
+        while not done:
+            observation, _, terminated, truncated, info = env.step(novice(observation))
+            done = terminated or truncated
+        assert info["is_success"]
+    assert env.takeover_rate < 0.1
+
+
+def test_display_of_the_takeover():
+    env = InterventionWrapper(gym.make("SafeDrive-v0", render_mode="rgb_array"), rule="always", armed=True)
+    env.set_stage(1)
+    env.reset(seed=0, options={"scenario": 100})
+    before = env.render()
+    env.step(np.zeros(2, np.float32))
+    after = env.render()
+    assert env.unwrapped.hud == {"takeover": True, "steps": 1, "takeover rate": 1.0, "stage": 1}
+    assert (before[:60, 300:500] != after[:60, 300:500]).any()  # the banner

@@ -122,7 +122,7 @@ class SafeDriveEnv(gym.Env):
                 raise ValueError(f"blocks must be 1 to 12 letters out of {BLOCKS!r}, or a number of blocks, got {blocks!r}.")
         else:
             check_integer("blocks", blocks, low=1)
-            check_range("blocks", blocks, high=12)
+            check_range("blocks", blocks, low=1, high=12)
         coefficients = dict(
             displacement_reward=displacement_reward, speed_reward=speed_reward, collision_penalty=collision_penalty,
             arrival_reward=arrival_reward, out_of_road_penalty=out_of_road_penalty,

@@ -156,7 +156,7 @@ class Traffic:
     def _appear(self, ego_s: float, ego_position: np.ndarray) -> None:
         """Cars whose time has come, unless there is somebody in their place."""
         for car in np.flatnonzero((self.state == HIDDEN) & (self.trigger <= ego_s)):
-            if self._stands_on_obstacle(car):
+            if self._stands_on_obstacle(int(car)):
                 self.state[car] = GONE
                 continue
             position, _ = self.poses(self.path[car], self.s[car], self.lateral[car])
