@@ -53,6 +53,7 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=100, help="number of test maps")
     parser.add_argument("--every", type=int, default=50_000, help="labels between two tests")
     parser.add_argument("--epochs", type=int, default=4)
+    parser.add_argument("--hidden", type=int, default=256, help="width of both hidden layers")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=RESULTS / "dagger.csv")
     args = parser.parse_args()
@@ -61,9 +62,8 @@ def main() -> None:
     rng = np.random.default_rng(args.seed)
     env = gym.make("SafeDrive-v0").unwrapped
     expert = env.scripted_driver("scripted-ideal")
-    net = nn.Sequential(
-        nn.Linear(env.observation_space.shape[0], 256), nn.ReLU(), nn.Linear(256, 256), nn.ReLU(), nn.Linear(256, 2), nn.Tanh()
-    )
+    n_inputs, n = env.observation_space.shape[0], args.hidden
+    net = nn.Sequential(nn.Linear(n_inputs, n), nn.ReLU(), nn.Linear(n, n), nn.ReLU(), nn.Linear(n, 2), nn.Tanh())
     optimizer = th.optim.Adam(net.parameters(), lr=1e-3)
 
     def policy(observation):
@@ -98,6 +98,7 @@ def main() -> None:
             _, _, episodes = drive(env, policy, expert, tests, rng)
             success, cost, total, completion = episodes.mean(axis=0)
             row = [
+                args.hidden,
                 args.seed,
                 args.maps,
                 len(data_x),
@@ -113,7 +114,9 @@ def main() -> None:
             with args.out.open("a", newline="") as file:
                 writer = csv.writer(file)
                 if new:
-                    writer.writerow(["seed", "maps", "labels", "loss", "success", "cost", "return", "route_completion"])
+                    writer.writerow(
+                        ["hidden", "seed", "maps", "labels", "loss", "success", "cost", "return", "route_completion"]
+                    )
                 writer.writerow(row)
 
 
