@@ -30,6 +30,13 @@ bench: $(INSTALLED)
 	$(BIN)/python benchmarks/speed.py
 	$(BIN)/python benchmarks/learning.py run --jobs 2
 	$(BIN)/python benchmarks/learning.py report
+	$(BIN)/python benchmarks/safedrive.py speed
+	$(BIN)/python benchmarks/safedrive.py drivers
+	$(BIN)/python benchmarks/safedrive.py traffic
+	$(BIN)/python benchmarks/safedrive.py takeovers
+	$(BIN)/python benchmarks/safedrive.py learn --jobs 2
+	$(BIN)/python benchmarks/safedrive.py report
+	$(BIN)/python benchmarks/dagger.py --hidden 512
 
 $(INSTALLED): setup.cfg pyproject.toml constraints.txt build_hooks.py sb3_chac.pth sb3_chac.start
 	python3 -m venv $(VENV)
