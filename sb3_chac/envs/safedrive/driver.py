@@ -1,4 +1,4 @@
-"""A scripted driver for SafeDrive: the human's stand-in. It knows the map, and where the others are and want to go."""
+"""A scripted driver for SafeDrive: the human's stand-in. It knows the map, and where those whom it sees want to go."""
 
 from collections import deque
 from typing import TYPE_CHECKING, NamedTuple
@@ -47,14 +47,15 @@ class Others(NamedTuple):
 class ScriptedDriver:
     """
     Samples plans (one of two lanes, one of six accelerations), compares where each would lead within 3.6 s with where
-    everybody else will be if they go on as they do, and follows the best by pure pursuit (Coulter 1992). It keeps no plan
-    from one step to the next, and plans about as good as the best are mixed: similar situations get similar actions, which
-    is what makes it fit to be imitated.
+    everybody whom the lidar sees will be if they go on as they do, and follows the best by pure pursuit (Coulter 1992). It
+    keeps no plan from one step to the next, and plans about as good as the best are mixed: similar situations get similar
+    actions, which is what makes it fit to be imitated. Call ``reset`` when an episode begins.
 
     :param env: the environment in which it drives
     :param reaction_delay: [steps of 0.1 s] it sees the others as they were that long ago
     :param action_noise: standard deviation of the noise on both actions (first-order autoregressive, 0.8 from step to step)
     :param desired_speed: [m/s]
+    :raises ValueError: for an argument out of its range
     """
 
     def __init__(

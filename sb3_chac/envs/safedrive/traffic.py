@@ -116,6 +116,7 @@ class Traffic:
         self.state[car], self.speed[car] = CRASHED, 0.0
 
     def remove_obstacle(self, obstacle: int) -> None:
+        """It has fallen over, or was towed away."""
         self.obstacle_there[obstacle] = False
 
     def step(
@@ -125,6 +126,9 @@ class Traffic:
         :param dt: [s]
         :param ego_s: [m] along the route
         :param ego_lateral: [m] to the right of it
+        :param ego_speed: [m/s]
+        :param ego_position: [m], shape (2,)
+        :param ego_heading: [rad]
         """
         self._appear(ego_s, ego_position)
         cars = self.visible
