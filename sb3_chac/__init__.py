@@ -8,15 +8,24 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from sb3_chac.chac import CHAC
+    from sb3_chac.dpvp import DPVP
     from sb3_chac.dsac import DSAC
     from sb3_chac.human import InterventionWrapper
+    from sb3_chac.pvp import PVP
 
 __version__ = (Path(__file__).parent / "version.txt").read_text().strip()
 
 # Public name -> module that defines it
-_EXPORTS = {"DSAC": "sb3_chac.dsac", "InterventionWrapper": "sb3_chac.human"}
+_EXPORTS = {
+    "CHAC": "sb3_chac.chac",
+    "DPVP": "sb3_chac.dpvp",
+    "DSAC": "sb3_chac.dsac",
+    "InterventionWrapper": "sb3_chac.human",
+    "PVP": "sb3_chac.pvp",
+}
 
-__all__ = ["DSAC", "InterventionWrapper", "__version__"]
+__all__ = ["CHAC", "DPVP", "DSAC", "PVP", "InterventionWrapper", "__version__"]
 
 
 def __getattr__(name: str) -> Any:

@@ -71,3 +71,18 @@ def clipped_normal_like(values: th.Tensor, bound: float = 3.0) -> th.Tensor:
     density = math.exp(-0.5 * bound**2) / math.sqrt(2 * math.pi)
     variance = inside - 2 * bound * density + bound**2 * (1 - inside)
     return th.randn_like(values).clamp_(-bound, bound).div_(math.sqrt(variance))
+
+
+def probability_of_improvement(
+    q_values: th.Tensor, stds: th.Tensor, baseline_q_values: th.Tensor, baseline_stds: th.Tensor
+) -> th.Tensor:
+    """
+    ``P(X > Y) = Phi((Q_X - Q_Y) / sqrt(sigma_X^2 + sigma_Y^2))`` of independent X ~ N(Q_X, sigma_X^2), Y ~ N(Q_Y, sigma_Y^2):
+    C-HAC's confidence that an action brings a higher return than the baseline's.
+
+    :param q_values: Q_X, any shape
+    :param stds: sigma_X, same shape, as the other two
+    :return: between 0 and 1, same shape; 0.5 where both distributions are the same
+    """
+    spread = (stds.square() + baseline_stds.square()).sqrt()
+    return th.special.ndtr((q_values - baseline_q_values) / spread)

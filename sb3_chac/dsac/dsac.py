@@ -1,3 +1,4 @@
+from collections import defaultdict
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -5,15 +6,15 @@ import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
-from stable_baselines3.common.utils import FloatSchedule, get_parameters_by_name, update_learning_rate
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, PyTorchObs, Schedule
+from stable_baselines3.common.utils import FloatSchedule, update_learning_rate
 from stable_baselines3.sac.policies import Actor
 
 from sb3_chac.common.checks import check_integer, check_learning_rate, check_range
 from sb3_chac.common.critics import DistributionalCritic
-from sb3_chac.common.distributional import clipped_normal_like, gaussian_nll, gaussian_surrogate_loss
+from sb3_chac.common.distributional import gaussian_nll, gaussian_surrogate_loss
 from sb3_chac.common.off_policy_algorithm import CheckedOffPolicyAlgorithm
-from sb3_chac.common.utils import frozen, polyak_update
+from sb3_chac.common.utils import TargetUpdate, frozen, minimize
 from sb3_chac.dsac.policies import CnnPolicy, DSACPolicy, MlpPolicy, MultiInputPolicy
 
 SelfDSAC = TypeVar("SelfDSAC", bound="DSAC")
@@ -182,11 +183,10 @@ class DSAC(CheckedOffPolicyAlgorithm):
     def _setup_model(self) -> None:
         super()._setup_model()
         self._create_aliases()
-        # Batch norm statistics are copied to the targets, not averaged (as in SB3, GH issue #996)
-        self.batch_norm_stats = get_parameters_by_name(self.critic, ["running_"])
-        self.batch_norm_stats += get_parameters_by_name(self.actor, ["running_"])
-        self.batch_norm_stats_target = get_parameters_by_name(self.critic_target, ["running_"])
-        self.batch_norm_stats_target += get_parameters_by_name(self.actor_target, ["running_"])
+        self.target_updates = [
+            TargetUpdate(self.critic, self.critic_target),
+            TargetUpdate(self.actor, self.actor_target),
+        ]
         self.ent_coef_lr_schedule = FloatSchedule(self.ent_coef_lr)
 
         if self.target_entropy == "auto":
@@ -198,6 +198,10 @@ class DSAC(CheckedOffPolicyAlgorithm):
         self.log_ent_coef.requires_grad_(learn_ent_coef)
         if learn_ent_coef:
             self.ent_coef_optimizer = th.optim.Adam([self.log_ent_coef], lr=self.ent_coef_lr_schedule(1.0), fused=True)
+
+    def _optimizers(self) -> list[th.optim.Optimizer]:
+        """Those that follow ``learning_rate``."""
+        return [self.actor.optimizer, self.critic.optimizer]
 
     def _create_aliases(self) -> None:
         self.actor = self.policy.actor
@@ -238,85 +242,93 @@ class DSAC(CheckedOffPolicyAlgorithm):
         # Switch to train mode (this affects batch norm / dropout)
         self.policy.set_training_mode(True)
         # Update learning rates according to their schedules
-        self._update_learning_rate([self.actor.optimizer, self.critic.optimizer])
+        self._update_learning_rate(self._optimizers())
         if self.ent_coef_optimizer is not None:
             update_learning_rate(self.ent_coef_optimizer, self.ent_coef_lr_schedule(self._current_progress_remaining))
-        tau_b = self.tau if self.tau_b is None else self.tau_b
-        critic_params = self.critic.optimizer.param_groups[0]["params"]
         # Kept as tensors and read only once, at the end
-        critic_stats, actor_stats = [], []
+        stats: defaultdict[str, list[th.Tensor]] = defaultdict(list)
 
         for _ in range(gradient_steps):
             self._n_updates += 1
-            # Sample replay buffer
-            replay_data = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)  # type: ignore[union-attr]
-            # For n-step replay, discount factor is gamma**n_steps (when no early termination)
-            discounts = replay_data.discounts.flatten() if replay_data.discounts is not None else self.gamma
-            rewards, dones = replay_data.rewards.flatten(), replay_data.dones.flatten()
-            ent_coef = self.log_ent_coef.detach().exp()
-
             # We need to sample because `log_std` may have changed between two gradient steps
             if self.use_sde:
                 self.policy.reset_noise()
-
-            with th.no_grad():
-                # a' from the target actor; mean and sample from the target critic with the smaller mean
-                next_actions, next_log_prob = self.actor_target.action_log_prob(replay_data.next_observations)
-                next_q_values, next_stds = self.critic_target(replay_data.next_observations, next_actions)
-                smaller = next_q_values.argmin(dim=0, keepdim=True)
-                next_q = next_q_values.gather(0, smaller).squeeze(0)
-                next_z = next_q + clipped_normal_like(next_q) * next_stds.gather(0, smaller).squeeze(0)
-                # y_q and y_z, shape (batch_size,)
-                entropy_term = ent_coef * next_log_prob
-                mean_targets = rewards + (1 - dones) * discounts * (next_q - entropy_term)
-                sampled_targets = rewards + (1 - dones) * discounts * (next_z - entropy_term)
-
-            # Optimize the critics, all shapes (n_critics, batch_size)
-            q_values, stds = self.critic(replay_data.observations, replay_data.actions)
-            mean_std = self.critic.update_mean_std(stds, tau_b)
-            losses = gaussian_surrogate_loss(q_values, stds, mean_targets, sampled_targets, mean_std, self.eta)
-            self.critic.optimizer.zero_grad()
-            losses.mean(dim=1).sum().backward()
-            self.critic.optimizer.step()
-            with th.no_grad():
-                nll = gaussian_nll(q_values, stds, sampled_targets).mean()
-                critic_stats.append(th.stack([nll, q_values.mean(), stds.mean()]))
-
-            if self._n_updates % self.policy_delay != 0:
-                continue
-
-            # Optimize the actor against the smaller mean
-            actions_pi, log_prob = self.actor.action_log_prob(replay_data.observations)
-            with frozen(critic_params):
-                q_values_pi, _ = self.critic(replay_data.observations, actions_pi)
-                actor_loss = (ent_coef * log_prob - q_values_pi.min(dim=0).values).mean()
-                self.actor.optimizer.zero_grad()
-                actor_loss.backward()
-            self.actor.optimizer.step()
-
-            # Optimize the entropy coefficient, alpha in the paper
-            entropy = -log_prob.detach().mean()
-            if self.ent_coef_optimizer is not None:
-                ent_coef_loss = (self.log_ent_coef * (entropy - float(self.target_entropy))).mean()
-                self.ent_coef_optimizer.zero_grad()
-                ent_coef_loss.backward()
-                self.ent_coef_optimizer.step()
-            actor_stats.append(th.stack([actor_loss.detach(), entropy, ent_coef.squeeze()]))
-
-            # Update target networks
-            if (self._n_updates // self.policy_delay) % self.target_update_interval == 0:
-                polyak_update(self.critic.parameters(), self.critic_target.parameters(), self.tau)
-                polyak_update(self.actor.parameters(), self.actor_target.parameters(), self.tau)
-                polyak_update(self.batch_norm_stats, self.batch_norm_stats_target, 1.0)
+            for name, value in self._gradient_step(self._sample_batch(batch_size)).items():
+                stats[name].append(value)
 
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        self._record_means(["critic_nll", "q_mean", "sigma_mean"], critic_stats)
-        self._record_means(["actor_loss", "entropy", "ent_coef"], actor_stats)
+        for name, values in stats.items():
+            self.logger.record(f"train/{name}", th.stack(values).mean().item())
 
-    def _record_means(self, names: list[str], stats: list[th.Tensor]) -> None:
-        if stats:
-            for name, mean in zip(names, th.stack(stats).mean(dim=0).tolist(), strict=True):
-                self.logger.record(f"train/{name}", mean)
+    def _sample_batch(self, batch_size: int) -> Any:
+        return self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)  # type: ignore[union-attr]
+
+    def _gradient_step(self, batch: Any) -> dict[str, th.Tensor]:
+        """
+        :param batch: from the replay buffer
+        :return: what to log, scalars
+        """
+        ent_coef = self.log_ent_coef.detach().exp()
+        # Optimize the critics
+        targets = self._return_targets(self.critic_target, batch, batch.rewards.flatten(), ent_coef)
+        losses, _, stats = self._critic_losses(self.critic, batch, targets)
+        minimize(losses.mean(dim=1).sum(), self.critic.optimizer)
+
+        if self._n_updates % self.policy_delay == 0:
+            stats |= self._update_actor(self.actor, self.critic, batch.observations, ent_coef)
+            if (self._n_updates // self.policy_delay) % self.target_update_interval == 0:
+                for update in self.target_updates:
+                    update(self.tau)
+        return stats
+
+    @th.no_grad()
+    def _return_targets(
+        self, critic_target: DistributionalCritic, batch: Any, rewards: th.Tensor, ent_coef: th.Tensor
+    ) -> tuple[th.Tensor, th.Tensor]:
+        """
+        :return: y_q and y_z with a' from the target actor, both of shape (batch_size,)
+        """
+        next_actions, next_log_prob = self.actor_target.action_log_prob(batch.next_observations)
+        return critic_target.backup(
+            rewards, self._discounts(batch), batch.next_observations, next_actions, ent_coef * next_log_prob
+        )
+
+    def _discounts(self, batch: Any) -> th.Tensor:
+        # For n-step replay, discount factor is gamma**n_steps (when no early termination)
+        gamma = self.gamma if batch.discounts is None else batch.discounts.flatten()
+        return (1 - batch.dones.flatten()) * gamma
+
+    def _critic_losses(
+        self, critic: DistributionalCritic, batch: Any, targets: tuple[th.Tensor, th.Tensor], eta: float | None = None
+    ) -> tuple[th.Tensor, tuple[th.Tensor, th.Tensor], dict[str, th.Tensor]]:
+        """
+        :return: losses of shape (n_critics, batch_size), (Q, sigma) of the same shape, and what to log
+        """
+        q_values, stds = critic(batch.observations, batch.actions)
+        mean_std = critic.update_mean_std(stds, self.tau if self.tau_b is None else self.tau_b)
+        losses = gaussian_surrogate_loss(q_values, stds, *targets, mean_std, self.eta if eta is None else eta)
+        with th.no_grad():
+            nll = gaussian_nll(q_values, stds, targets[1]).mean()
+            stats = {"critic_nll": nll, "q_mean": q_values.mean(), "sigma_mean": stds.mean()}
+        return losses, (q_values, stds), stats
+
+    def _update_actor(
+        self, actor: Actor, critic: DistributionalCritic, observations: PyTorchObs, ent_coef: th.Tensor
+    ) -> dict[str, th.Tensor]:
+        """
+        Optimize an actor against the smaller mean of a critic, and the entropy coefficient.
+
+        :return: what to log
+        """
+        actions, log_prob = actor.action_log_prob(observations)
+        with frozen(critic.optimizer.param_groups[0]["params"]):
+            q_values, _ = critic(observations, actions)
+            actor_loss = (ent_coef * log_prob - q_values.min(dim=0).values).mean()
+            minimize(actor_loss, actor.optimizer)
+        entropy = -log_prob.detach().mean()
+        if self.ent_coef_optimizer is not None:
+            minimize((self.log_ent_coef * (entropy - float(self.target_entropy))).mean(), self.ent_coef_optimizer)
+        return {"actor_loss": actor_loss.detach(), "entropy": entropy, "ent_coef": ent_coef.squeeze()}
 
     def learn(
         self: SelfDSAC,
@@ -339,7 +351,7 @@ class DSAC(CheckedOffPolicyAlgorithm):
     def _excluded_save_params(self) -> list[str]:
         # Aliases of what the policy holds
         aliases = ["actor", "actor_target", "critic", "critic_target", "log_ent_coef"]
-        return [*super()._excluded_save_params(), *aliases, "batch_norm_stats", "batch_norm_stats_target"]
+        return [*super()._excluded_save_params(), *aliases, "target_updates"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         state_dicts = ["policy", "actor.optimizer", "critic.optimizer"]

@@ -11,7 +11,7 @@ from typing import Any
 import sb3_chac
 
 # Names on RL-Zoo3's command line -> public class
-ALGORITHMS = {"dsac": "DSAC"}
+ALGORITHMS = {"dsac": "DSAC", "pvp": "PVP", "dpvp": "DPVP", "chac": "CHAC"}
 
 
 def hyperparams_file(algo: str) -> Path:

@@ -1,0 +1,4 @@
+from sb3_chac.chac.chac import CHAC
+from sb3_chac.chac.policies import CnnPolicy, MlpPolicy, MultiInputPolicy
+
+__all__ = ["CHAC", "CnnPolicy", "MlpPolicy", "MultiInputPolicy"]

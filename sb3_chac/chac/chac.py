@@ -1,0 +1,426 @@
+from collections import defaultdict
+from typing import Any, ClassVar, TypeVar
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.sac.policies import Actor
+
+from sb3_chac.chac.policies import CONTROLS, CHACPolicy, CnnPolicy, MlpPolicy, MultiInputPolicy
+from sb3_chac.common.buffers import DualReplayBuffer, DualReplayBufferSamples
+from sb3_chac.common.checks import check_integer, check_range
+from sb3_chac.common.critics import DistributionalCritic
+from sb3_chac.common.utils import TargetUpdate, minimize
+from sb3_chac.dpvp.dpvp import DPVP
+
+SelfCHAC = TypeVar("SelfCHAC", bound="CHAC")
+
+
+class CHAC(DPVP):
+    """
+    Confidence-Guided Human-AI Collaboration (C-HAC).
+    Paper: "Confidence-Guided Human-AI Collaboration" (Li et al. 2025).
+
+    **Stage 1** is D-PVP (see ``DPVP``): the human-guided policy pi_g learns from takeovers. Beside it the confidence return
+    distribution Z_c learns the reward's return of pi_g, as in DSAC.
+
+    **Stage 2** begins after ``switch_after`` steps. The human is no longer asked, pi_g and Z_g stay as they are. The
+    self-learning policy pi_r goes on from pi_g and maximises Q_c - alpha log pi_r on what is now collected. It acts only where
+    the return distribution says, with enough confidence, that it does better::
+
+        P(Q_r > Q_g) = Phi( (Q_c(s, a_r) - Q_c(s, a_g)) / sqrt(sigma_c(s, a_r)^2 + sigma_c(s, a_g)^2) ) > 1 - delta
+
+    with a_r a sample of pi_r (its mode if ``deterministic``) and a_g the mode of pi_g; Q and sigma are those of the critic
+    with the smaller mean. ``predict`` runs the same shared control.
+
+    Differences from the paper, besides those of ``DPVP``:
+
+    - The paper's second condition, a mean log pi_g below a threshold, is off by default: log pi rises as a policy sharpens.
+    - sigma_c is the spread of the RETURN, which hardly any gain of pi_r exceeds: with a calibrated sigma_c pi_r never drives,
+      and nothing corrects what Z_c believes of it. ``sigma_scale`` says by how much it is scaled in the confidence.
+    - Z_c is far from converged at the switch: it follows its target faster (``tau_c``) and is fitted to both stores first
+      (``prefit_steps``).
+    - In stage 2, Z_c bootstraps on what is executed, not on pi_r alone (``bootstrap``).
+
+    ``preset`` fills in the arguments that are None, those of ``DPVP`` and:
+
+    ==================  ==========  =======
+    argument            "default"   "paper"
+    ==================  ==========  =======
+    sigma_scale         0.08        1
+    tau_c               0.02        ``tau``
+    prefit_steps        5000        0
+    bootstrap           "executed"  "self"
+    stage2_human_share  0.25        0
+    ==================  ==========  =======
+
+    :param policy: The policy model to use (MlpPolicy, CnnPolicy, MultiInputPolicy)
+    :param env: The environment to learn from (if registered in Gym, can be str), with a bounded Box action space
+    :param learning_rate: learning rate of the actor and the critics,
+        it can be a function of the current progress remaining (from 1 to 0)
+    :param buffer_size: capacity of each of the two stores, in transitions
+    :param learning_starts: how many steps of the model to collect transitions for before learning starts
+    :param batch_size: Minibatch size for each gradient update
+    :param tau: the soft update coefficient of the target networks (between 0 and 1)
+    :param gamma: the discount factor
+    :param train_freq: Update the model every ``train_freq`` steps. Alternatively pass a tuple of frequency and unit
+        like ``(5, "step")`` or ``(2, "episode")``.
+    :param gradient_steps: How many gradient steps to do after each rollout (see ``train_freq``)
+        Set to ``-1`` means to do as many gradient steps as steps done in the environment during the rollout.
+    :param action_noise: the action noise type (None by default), added to the sampled action
+    :param replay_buffer_class: ``DualReplayBuffer``, or a class derived from it
+    :param replay_buffer_kwargs: Keyword arguments to pass to the replay buffer on creation.
+    :param optimize_memory_usage: not supported, must be False
+    :param n_steps: number of rewards in a return; it ends early where the driver changes
+    :param ent_coef: Entropy regularization coefficient alpha. Set it to 'auto' to learn it
+        (and 'auto_0.1' for using 0.1 as initial value)
+    :param target_update_interval: update the target networks every ``target_update_interval`` actor updates
+    :param target_entropy: target entropy when learning ``ent_coef``, 'auto' is minus the number of actions
+    :param ent_coef_lr: learning rate of the entropy coefficient, can be a schedule too
+    :param policy_delay: gradient steps of the critics per update of the actor, the entropy coefficient and all targets
+    :param eta: weight of sigma^2 in the critic's loss; sigma^2 shrinks as 1 / eta, 1 keeps it calibrated
+    :param tau_b: coefficient of the running mean of sigma that scales and clips the critic's loss; ``tau`` if None
+    :param preset: "default" or "paper", see above
+    :param proxy_value: B, the label of the human's actions; minus B is the label of the novice's
+    :param pv_coef: weight of the labels
+    :param pv_min_diff: no label -B where the root mean square of a_h - a_n, both in [-1, 1], is smaller
+    :param eta_pv: weight of sigma^2 in the loss of the labels, ``eta`` if None
+    :param takeover_stop_td: leave temporal differences out on the first step of a takeover
+    :param delta: pi_r acts where P(Q_r > Q_g) is above 1 - delta. 0 leaves pi_g alone, 0.5 compares the means (the ablation
+        "No Confidence")
+    :param shared_control: if False, pi_r always acts in stage 2 (the ablation "No Share")
+    :param switch_after: N_g, stage 2 begins after more than this many steps of stage 1 (in all environments)
+    :param sigma_threshold: and when the running mean of sigma_c is below it; not asked if None
+    :param log_prob_threshold: kappa, and when the mean log pi_g of a batch is below it (log pi rises as a policy sharpens);
+        not asked if None
+    :param eta_c: weight of sigma^2 in the loss of Z_c, ``eta`` if None; above 1 it shrinks sigma_c
+    :param sigma_scale: factor of sigma_c in the confidence
+    :param tau_c: the soft update coefficient of the target of Z_c
+    :param prefit_steps: gradient steps of Z_c, on both stores, at the switch
+    :param bootstrap: "executed": Z_c evaluates what is executed in stage 2 (shared control); "self": pi_r
+    :param stage2_human_share: share of the human's transitions in the batches of stage 2
+    :param use_sde: Whether to use generalized State Dependent Exploration (gSDE)
+        instead of action noise exploration (default: False)
+    :param sde_sample_freq: Sample a new noise matrix every n steps when using gSDE
+        Default: -1 (only sample at the beginning of the rollout)
+    :param use_sde_at_warmup: Whether to use gSDE instead of uniform sampling
+        during the warm up phase (before learning starts)
+    :param stats_window_size: Window size for the rollout logging, specifying the number of episodes to average
+        the reported success rate, mean episode length, and mean reward over
+    :param tensorboard_log: the log location for tensorboard (if None, no logging)
+    :param policy_kwargs: additional arguments to be passed to the policy on creation, see ``DSACPolicy``
+    :param verbose: Verbosity level: 0 for no output, 1 for info messages (such as device or wrappers used), 2 for
+        debug messages
+    :param seed: Seed for the pseudo random generators
+    :param device: Device (cpu, cuda, ...) on which the code should be run.
+        Setting it to auto, the code will be run on the GPU if possible.
+    :param _init_setup_model: Whether or not to build the network at the creation of the instance
+    :raises ValueError: for an argument out of its range, an action space that is not a bounded Box, or, while learning,
+        an observation or reward that is NaN or infinite
+    """
+
+    presets: ClassVar[dict[str, dict[str, Any]]] = {
+        "default": DPVP.presets["default"]
+        | {"sigma_scale": 0.08, "tau_c": 0.02, "prefit_steps": 5000, "bootstrap": "executed", "stage2_human_share": 0.25},
+        "paper": DPVP.presets["paper"]
+        | {"sigma_scale": 1.0, "prefit_steps": 0, "bootstrap": "self", "stage2_human_share": 0.0},
+    }
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
+        "MlpPolicy": MlpPolicy,
+        "CnnPolicy": CnnPolicy,
+        "MultiInputPolicy": MultiInputPolicy,
+    }
+    required_policy = CHACPolicy
+    policy: CHACPolicy
+    confidence_critic: DistributionalCritic
+    confidence_critic_target: DistributionalCritic
+    self_actor: Actor
+    self_actor_target: Actor
+
+    def __init__(
+        self,
+        policy: str | type[CHACPolicy],
+        env: GymEnv | str,
+        learning_rate: float | Schedule = 1e-4,
+        buffer_size: int = 1_000_000,  # 1e6
+        learning_starts: int = 100,
+        batch_size: int = 256,
+        tau: float = 0.005,
+        gamma: float = 0.99,
+        train_freq: int | tuple[int, str] = 1,
+        gradient_steps: int = 1,
+        action_noise: ActionNoise | None = None,
+        replay_buffer_class: type[DualReplayBuffer] | None = None,
+        replay_buffer_kwargs: dict[str, Any] | None = None,
+        optimize_memory_usage: bool = False,
+        n_steps: int = 1,
+        ent_coef: str | float | None = None,
+        target_update_interval: int = 1,
+        target_entropy: str | float = "auto",
+        ent_coef_lr: float | Schedule = 3e-4,
+        policy_delay: int = 2,
+        eta: float = 1.0,
+        tau_b: float | None = None,
+        preset: str = "default",
+        proxy_value: float = 1.0,
+        pv_coef: float = 1.0,
+        pv_min_diff: float | None = None,
+        eta_pv: float | None = None,
+        takeover_stop_td: bool = False,
+        delta: float = 0.15,
+        shared_control: bool = True,
+        switch_after: int = 50_000,
+        sigma_threshold: float | None = None,
+        log_prob_threshold: float | None = None,
+        eta_c: float | None = None,
+        sigma_scale: float | None = None,
+        tau_c: float | None = None,
+        prefit_steps: int | None = None,
+        bootstrap: str | None = None,
+        stage2_human_share: float | None = None,
+        use_sde: bool = False,
+        sde_sample_freq: int = -1,
+        use_sde_at_warmup: bool = False,
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        policy_kwargs: dict[str, Any] | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: th.device | str = "auto",
+        _init_setup_model: bool = True,
+    ):
+        super().__init__(
+            policy=policy,
+            env=env,
+            learning_rate=learning_rate,
+            buffer_size=buffer_size,
+            learning_starts=learning_starts,
+            batch_size=batch_size,
+            tau=tau,
+            gamma=gamma,
+            train_freq=train_freq,
+            gradient_steps=gradient_steps,
+            action_noise=action_noise,
+            replay_buffer_class=replay_buffer_class,
+            replay_buffer_kwargs=replay_buffer_kwargs,
+            optimize_memory_usage=optimize_memory_usage,
+            n_steps=n_steps,
+            ent_coef=ent_coef,
+            target_update_interval=target_update_interval,
+            target_entropy=target_entropy,
+            ent_coef_lr=ent_coef_lr,
+            policy_delay=policy_delay,
+            eta=eta,
+            tau_b=tau_b,
+            preset=preset,
+            proxy_value=proxy_value,
+            pv_coef=pv_coef,
+            pv_min_diff=pv_min_diff,
+            eta_pv=eta_pv,
+            takeover_stop_td=takeover_stop_td,
+            use_sde=use_sde,
+            sde_sample_freq=sde_sample_freq,
+            use_sde_at_warmup=use_sde_at_warmup,
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            policy_kwargs=policy_kwargs,
+            verbose=verbose,
+            seed=seed,
+            device=device,
+            _init_setup_model=False,
+        )
+        self.delta = delta
+        self.shared_control = shared_control
+        self.switch_after = switch_after
+        self.sigma_threshold = sigma_threshold
+        self.log_prob_threshold = log_prob_threshold
+        self.eta_c = eta_c
+        # The preset replaces None
+        self.sigma_scale: Any = sigma_scale
+        self.tau_c: Any = tau_c
+        self.prefit_steps: Any = prefit_steps
+        self.bootstrap: Any = bootstrap
+        self.stage2_human_share: Any = stage2_human_share
+
+        if _init_setup_model:
+            self._setup_model()
+
+    def _setup_model(self) -> None:
+        super()._setup_model()
+        self.policy.delta, self.policy.sigma_scale = self.delta, self.sigma_scale
+        self.policy.control = "shared" if self.shared_control else "self"
+        self.confidence_update = TargetUpdate(self.confidence_critic, self.confidence_critic_target)
+        self.self_update = TargetUpdate(self.self_actor, self.self_actor_target)
+        self.choices: defaultdict[str, list[np.ndarray]] = defaultdict(list)
+
+    def _create_aliases(self) -> None:
+        super()._create_aliases()
+        self.confidence_critic = self.policy.confidence_critic
+        self.confidence_critic_target = self.policy.confidence_critic_target
+        self.self_actor = self.policy.self_actor
+        self.self_actor_target = self.policy.self_actor_target
+
+    def _check_arguments(self) -> None:
+        super()._check_arguments()
+        check_range("delta", self.delta, low=0.0, high=1.0)
+        check_integer("switch_after", self.switch_after, low=0)
+        for name in ("sigma_threshold", "log_prob_threshold"):
+            if getattr(self, name) is not None:
+                check_range(name, getattr(self, name))
+        for name in ("eta_c", "sigma_scale"):
+            if getattr(self, name) is not None:
+                check_range(name, getattr(self, name), low=0.0, exclusive_low=True)
+        if self.tau_c is not None:
+            check_range("tau_c", self.tau_c, low=0.0, high=1.0)
+        check_integer("prefit_steps", self.prefit_steps, low=0)
+        check_range("stage2_human_share", self.stage2_human_share, low=0.0, high=1.0)
+        if self.bootstrap not in ("executed", "self"):
+            raise ValueError(f"bootstrap must be 'executed' or 'self', got {self.bootstrap!r}.")
+
+    @property
+    def stage(self) -> int:
+        """1: the human guides; 2: self-learning under shared control."""
+        return int(self.policy.stage)
+
+    def _needs_human(self) -> bool:
+        return self.stage == 1
+
+    def _optimizers(self) -> list[th.optim.Optimizer]:
+        return [*super()._optimizers(), self.confidence_critic.optimizer, self.self_actor.optimizer]
+
+    def _sample_batch(self, batch_size: int) -> DualReplayBufferSamples:
+        share = 0.5 if self.stage == 1 else self.stage2_human_share
+        return self.replay_buffer.sample(batch_size, env=self._vec_normalize_env, human_share=share)
+
+    def _gradient_step(self, batch: DualReplayBufferSamples) -> dict[str, th.Tensor]:
+        if self.stage == 1:
+            return super()._gradient_step(batch) | self._update_confidence_critic(batch)
+        stats = self._update_confidence_critic(batch)
+        if self._n_updates % self.policy_delay == 0:
+            ent_coef = self.log_ent_coef.detach().exp()
+            stats |= self._update_actor(self.self_actor, self.confidence_critic, batch.observations, ent_coef)
+            self.self_update(self.tau)
+        return stats
+
+    def _update_confidence_critic(self, batch: DualReplayBufferSamples) -> dict[str, th.Tensor]:
+        """Z_c evaluates, with reward, what is executed."""
+        ent_coef = self.log_ent_coef.detach().exp()
+        with th.no_grad():
+            next_obs, target = batch.next_observations, self.confidence_critic_target
+            if self.stage == 1:
+                next_actions, next_log_prob = self.actor_target.action_log_prob(next_obs)
+            else:
+                next_actions, next_log_prob = self.self_actor_target.action_log_prob(next_obs)
+                if self.bootstrap == "executed" and self.shared_control:
+                    choice = self.policy.choose(next_obs, next_actions, target)
+                    # The mode of pi_g has no entropy
+                    next_actions, next_log_prob = choice.actions, next_log_prob * choice.self_drives
+            rewards, discounts = batch.rewards.flatten(), self._discounts(batch)
+            targets = target.backup(rewards, discounts, next_obs, next_actions, ent_coef * next_log_prob)
+        losses, _, stats = self._critic_losses(self.confidence_critic, batch, targets, self.eta_c)
+        minimize(losses.mean(dim=1).sum(), self.confidence_critic.optimizer)
+        self.confidence_update(self.tau if self.tau_c is None else self.tau_c)
+        return {f"confidence_{name}": value for name, value in stats.items()}
+
+    def _on_step(self) -> None:
+        super()._on_step()
+        if self.stage == 1 and self._guidance_is_over():
+            self._start_stage_2()
+
+    def _guidance_is_over(self) -> bool:
+        return (
+            self.counts["total_steps"] > self.switch_after
+            and self._n_updates > 0
+            and (self.sigma_threshold is None or self.confidence_critic.mean_std.mean().item() < self.sigma_threshold)
+            and (self.log_prob_threshold is None or self._mean_log_prob() < self.log_prob_threshold)
+        )
+
+    def _mean_log_prob(self) -> float:
+        """
+        :return: mean of log pi_g over a batch
+        """
+        with th.no_grad():
+            batch = super()._sample_batch(self.batch_size)
+            return self.actor.action_log_prob(batch.observations)[1].mean().item()
+
+    def _start_stage_2(self) -> None:
+        self._disarm()
+        self.policy.set_training_mode(True)
+        for _ in range(self.prefit_steps):
+            self._update_confidence_critic(super()._sample_batch(self.batch_size))
+        self.policy.set_training_mode(False)
+        self.policy.start_stage_2()
+        if self.env is not None and self.env.has_attr("set_stage"):
+            self.env.env_method("set_stage", 2)
+        if self.verbose > 0:
+            human_steps = int(self.counts["human_steps"])
+            print(f"C-HAC: stage 2 begins at step {self.num_timesteps}, after {human_steps} steps of the human")
+
+    def _sample_action(
+        self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
+    ) -> tuple[np.ndarray, np.ndarray]:
+        self.policy.last_choice = None
+        sampled = super()._sample_action(learning_starts, action_noise, n_envs)
+        if self.policy.last_choice is not None:
+            for name, values in self.policy.last_choice._asdict().items():
+                if name != "actions":
+                    self.choices[name].append(values.cpu().numpy())
+        return sampled
+
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+        policy: str | None = None,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """
+        As in SB3, and:
+
+        :param policy: who acts in stage 2: "guided" (pi_g), "self" (pi_r) or "shared"; by default as in training
+        :raises ValueError: for another ``policy``
+        """
+        if policy not in (None, *CONTROLS):
+            raise ValueError(f"policy must be one of {', '.join(map(repr, CONTROLS))}, got {policy!r}.")
+        usual = self.policy.control
+        self.policy.control = policy or usual
+        try:
+            return super().predict(observation, state, episode_start, deterministic)
+        finally:
+            self.policy.control = usual
+
+    def dump_logs(self) -> None:
+        self.logger.record("chac/stage", self.stage)
+        if self.choices:
+            means = {name: np.concatenate(values) for name, values in self.choices.items()}
+            self.choices.clear()
+            confidence = means.pop("confidence")
+            self.logger.record("chac/self_share", means.pop("self_drives").mean())
+            self.logger.record("chac/confidence_mean", confidence.mean())
+            for quantile in (0.1, 0.5, 0.9):
+                self.logger.record(f"chac/confidence_q{100 * quantile:.0f}", np.quantile(confidence, quantile))
+            for name, values in means.items():
+                self.logger.record(f"chac/{name}", values.mean())
+        super().dump_logs()
+
+    def learn(
+        self: SelfCHAC,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 4,
+        tb_log_name: str = "CHAC",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> SelfCHAC:
+        return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+
+    def _excluded_save_params(self) -> list[str]:
+        networks = ["confidence_critic", "confidence_critic_target", "self_actor", "self_actor_target"]
+        return [*super()._excluded_save_params(), *networks, "confidence_update", "self_update", "choices"]
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        state_dicts, tensors = super()._get_torch_save_params()
+        return [*state_dicts, "confidence_critic.optimizer", "self_actor.optimizer"], tensors

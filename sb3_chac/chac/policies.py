@@ -1,0 +1,133 @@
+from typing import Any, ClassVar, NamedTuple
+
+import torch as th
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor, NatureCNN
+from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
+from stable_baselines3.sac.policies import Actor
+
+from sb3_chac.common.critics import DistributionalCritic
+from sb3_chac.common.distributional import probability_of_improvement
+from sb3_chac.dsac.policies import DSACPolicy
+
+CONTROLS = ("guided", "self", "shared")
+
+
+class Choice(NamedTuple):
+    """What shared control decided in each of ``batch_size`` states."""
+
+    actions: th.Tensor  # executed, shape (batch_size, action_dim)
+    self_drives: th.Tensor  # whether they are pi_r's, shape (batch_size,), as all below
+    confidence: th.Tensor  # P(Q_r > Q_g)
+    q_self: th.Tensor
+    q_guided: th.Tensor
+    std_self: th.Tensor
+    std_guided: th.Tensor
+
+
+class CHACPolicy(DSACPolicy):
+    """
+    The two policies of C-HAC and what decides between them. To ``DSACPolicy`` (pi_g is its ``actor``, Z_g its ``critic``) it
+    adds the confidence return distribution Z_c (``confidence_critic``), the self-learning policy pi_r (``self_actor``) and
+    target copies of both.
+
+    In stage 1, and as ``control="guided"``, pi_g acts; as ``control="self"``, pi_r; as ``control="shared"``, pi_r where::
+
+        P(Q_r > Q_g) = Phi( (Q_c(s, a_r) - Q_c(s, a_g)) / sqrt(sigma_c(s, a_r)^2 + sigma_c(s, a_g)^2) ) > 1 - delta
+
+    and pi_g elsewhere. The parameters are those of ``DSACPolicy``, and by name:
+
+    :param delta: accepted probability that pi_r does worse, 0 (pi_g always acts) to 1
+    :param sigma_scale: factor of sigma_c in the confidence
+    :param control: who acts in stage 2: "guided", "self" or "shared"
+    """
+
+    confidence_critic: DistributionalCritic
+    confidence_critic_target: DistributionalCritic
+    self_actor: Actor
+    self_actor_target: Actor
+    stage: th.Tensor
+
+    def __init__(self, *args: Any, delta: float = 0.15, sigma_scale: float = 1.0, control: str = "shared", **kwargs: Any):
+        super().__init__(*args, **kwargs)
+        self.delta = delta
+        self.sigma_scale = sigma_scale
+        self.control = control
+        self.last_choice: Choice | None = None
+        # Saved with the parameters: a loaded policy acts as it did
+        self.register_buffer("stage", th.tensor(1, device=self.device))
+
+    def _build(self, lr_schedule: Schedule) -> None:
+        super()._build(lr_schedule)
+        self.confidence_critic, self.confidence_critic_target = (self.make_critic() for _ in range(2))
+        self.self_actor, self.self_actor_target = (self.make_actor() for _ in range(2))
+        self.confidence_critic_target.load_state_dict(self.confidence_critic.state_dict())
+        self.self_actor_target.load_state_dict(self.self_actor.state_dict())
+        for network in (self.confidence_critic, self.self_actor):
+            network.optimizer = self.optimizer_class(
+                network.parameters(),
+                lr=lr_schedule(1),  # type: ignore[call-arg]
+                **self.optimizer_kwargs,
+            )
+        for target in (self.confidence_critic_target, self.self_actor_target):
+            target.set_training_mode(False)
+
+    def start_stage_2(self) -> None:
+        """pi_r goes on from pi_g, with a fresh optimizer."""
+        self.self_actor.load_state_dict(self.actor.state_dict())
+        self.self_actor_target.load_state_dict(self.actor_target.state_dict())
+        self.self_actor.optimizer.state.clear()
+        self.stage.fill_(2)
+
+    def choose(self, observation: PyTorchObs, self_actions: th.Tensor, critic: DistributionalCritic) -> Choice:
+        """
+        :param observation: batch of observations
+        :param self_actions: a_r, shape (batch_size, action_dim); a_g is the mode of pi_g
+        :param critic: Z_c, or its target copy
+        """
+        guided_actions = self.actor(observation, deterministic=True)
+        q_self, std_self = critic.pessimistic(observation, self_actions)
+        q_guided, std_guided = critic.pessimistic(observation, guided_actions)
+        scaled = self.sigma_scale * std_self, self.sigma_scale * std_guided
+        confidence = probability_of_improvement(q_self, scaled[0], q_guided, scaled[1])
+        self_drives = confidence > 1 - self.delta
+        actions = th.where(self_drives.unsqueeze(1), self_actions, guided_actions)
+        return Choice(actions, self_drives, confidence, q_self, q_guided, std_self, std_guided)
+
+    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        control = "guided" if self.stage == 1 else self.control
+        if control == "guided":
+            return self.actor(observation, deterministic)
+        self_actions = self.self_actor(observation, deterministic)
+        if control == "self":
+            return self_actions
+        self.last_choice = self.choose(observation, self_actions, self.confidence_critic)
+        return self.last_choice.actions
+
+    def reset_noise(self, batch_size: int = 1) -> None:
+        super().reset_noise(batch_size)
+        self.self_actor.reset_noise(batch_size=batch_size)
+        self.self_actor_target.reset_noise(batch_size=batch_size)
+
+    def set_training_mode(self, mode: bool) -> None:
+        super().set_training_mode(mode)
+        self.confidence_critic.set_training_mode(mode)
+        self.self_actor.set_training_mode(mode)
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        own = {"delta": self.delta, "sigma_scale": self.sigma_scale, "control": self.control}
+        return super()._get_constructor_parameters() | own
+
+
+MlpPolicy = CHACPolicy
+
+
+class CnnPolicy(CHACPolicy):
+    """Policy for image observations: ``CHACPolicy`` with the CNN of the DQN Nature paper as features extractor."""
+
+    default_features_extractor: ClassVar[type[BaseFeaturesExtractor]] = NatureCNN
+
+
+class MultiInputPolicy(CHACPolicy):
+    """Policy for Dict observations: ``CHACPolicy`` with one features extractor per key."""
+
+    default_features_extractor: ClassVar[type[BaseFeaturesExtractor]] = CombinedExtractor

@@ -1,0 +1,274 @@
+import warnings
+from typing import Any, ClassVar, TypeVar
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+
+from sb3_chac.common.buffers import DualReplayBuffer, DualReplayBufferSamples, take_rows
+from sb3_chac.common.checks import check_range
+from sb3_chac.common.distributional import gaussian_surrogate_loss
+from sb3_chac.common.guided import GuidedOffPolicyAlgorithm
+from sb3_chac.common.utils import minimize
+from sb3_chac.dsac.dsac import DSAC
+from sb3_chac.dsac.policies import CnnPolicy, DSACPolicy, MlpPolicy, MultiInputPolicy
+
+SelfDPVP = TypeVar("SelfDPVP", bound="DPVP")
+
+
+class DPVP(GuidedOffPolicyAlgorithm, DSAC):
+    """
+    Distributional Proxy Value Propagation (D-PVP): a human takes over, and the takeovers shape the return distribution.
+    Paper: "Confidence-Guided Human-AI Collaboration" (C-HAC, Li et al. 2025), after PVP (Peng et al., NeurIPS 2023).
+
+    DSAC without reward. The proxy return distribution Z_g(s, a) ~ N(Q, sigma^2) learns from temporal differences with r = 0 on
+    the executed action a_b, and from two labels where the human drove (I = 1): +B for the human's action a_h, -B for the
+    action a_n that the novice had proposed. With L(y; s, a) the surrogate of -log N(y; Q(s, a), sigma(s, a)^2)
+    (``sb3_chac.common.distributional.gaussian_surrogate_loss``), averaged over the whole batch::
+
+        mean[ L(y; s, a_b) + pv_coef I (L(+B; s, a_h) + L(-B; s, a_n)) ],     y = gamma (1 - d) (Z_g(s', a') - alpha log pi_g)
+
+    The human-guided policy pi_g is DSAC's actor and maximises Q - alpha log pi_g. Half of a batch comes from each store.
+
+    Differences from the paper:
+
+    - D_KL(Dirac, Gaussian) is infinite: the cross-entropy -log N(B; Q, sigma^2) is minimised, in DSAC-T's stabilised form.
+    - The confidence distribution Z_c, which D-PVP itself has no use for, belongs to ``CHAC``.
+    - A transition is stored once: in the human's store if the human drove, in the novice's otherwise.
+    - The entropy bonus, which the novice can collect for ever by standing still, must not swamp labels of +-1 (it sums up to
+      gamma alpha H / (1 - gamma)): alpha is fixed at 0.01. ``preset="paper"`` learns it from 1, towards -8 per action.
+    - No -B where the novice proposed nearly what the human did (``pv_min_diff``): else both labels fall on one action.
+
+    ``preset`` fills in the arguments that are None:
+
+    ===============  =========  =======
+    argument         "default"  "paper"
+    ===============  =========  =======
+    ent_coef         0.01       "auto"
+    pv_min_diff      0.15       0
+    ===============  =========  =======
+
+    :param policy: The policy model to use (MlpPolicy, CnnPolicy, MultiInputPolicy)
+    :param env: The environment to learn from (if registered in Gym, can be str), with a bounded Box action space
+    :param learning_rate: learning rate of the actor and the critics,
+        it can be a function of the current progress remaining (from 1 to 0)
+    :param buffer_size: capacity of each of the two stores, in transitions
+    :param learning_starts: how many steps of the model to collect transitions for before learning starts
+    :param batch_size: Minibatch size for each gradient update
+    :param tau: the soft update coefficient of the target networks (between 0 and 1)
+    :param gamma: the discount factor
+    :param train_freq: Update the model every ``train_freq`` steps. Alternatively pass a tuple of frequency and unit
+        like ``(5, "step")`` or ``(2, "episode")``.
+    :param gradient_steps: How many gradient steps to do after each rollout (see ``train_freq``)
+        Set to ``-1`` means to do as many gradient steps as steps done in the environment during the rollout.
+    :param action_noise: the action noise type (None by default), added to the sampled action
+    :param replay_buffer_class: ``DualReplayBuffer``, or a class derived from it
+    :param replay_buffer_kwargs: Keyword arguments to pass to the replay buffer on creation.
+    :param optimize_memory_usage: not supported, must be False
+    :param n_steps: number of rewards in a return; it ends early where the driver changes
+    :param ent_coef: Entropy regularization coefficient alpha. Set it to 'auto' to learn it
+        (and 'auto_0.1' for using 0.1 as initial value)
+    :param target_update_interval: update the target networks every ``target_update_interval`` actor updates
+    :param target_entropy: target entropy when learning ``ent_coef``, 'auto' is minus the number of actions
+    :param ent_coef_lr: learning rate of the entropy coefficient, can be a schedule too
+    :param policy_delay: gradient steps of the critics per update of the actor, the entropy coefficient and all targets
+    :param eta: weight of sigma^2 in the critic's loss; sigma^2 shrinks as 1 / eta, 1 keeps it calibrated
+    :param tau_b: coefficient of the running mean of sigma that scales and clips the critic's loss; ``tau`` if None
+    :param preset: "default" or "paper", see above
+    :param proxy_value: B, the label of the human's actions; minus B is the label of the novice's
+    :param pv_coef: weight of the labels
+    :param pv_min_diff: no label -B where the root mean square of a_h - a_n, both in [-1, 1], is smaller
+    :param eta_pv: weight of sigma^2 in the loss of the labels, ``eta`` if None
+    :param takeover_stop_td: leave temporal differences out on the first step of a takeover
+    :param use_sde: Whether to use generalized State Dependent Exploration (gSDE)
+        instead of action noise exploration (default: False)
+    :param sde_sample_freq: Sample a new noise matrix every n steps when using gSDE
+        Default: -1 (only sample at the beginning of the rollout)
+    :param use_sde_at_warmup: Whether to use gSDE instead of uniform sampling
+        during the warm up phase (before learning starts)
+    :param stats_window_size: Window size for the rollout logging, specifying the number of episodes to average
+        the reported success rate, mean episode length, and mean reward over
+    :param tensorboard_log: the log location for tensorboard (if None, no logging)
+    :param policy_kwargs: additional arguments to be passed to the policy on creation, see ``DSACPolicy``
+    :param verbose: Verbosity level: 0 for no output, 1 for info messages (such as device or wrappers used), 2 for
+        debug messages
+    :param seed: Seed for the pseudo random generators
+    :param device: Device (cpu, cuda, ...) on which the code should be run.
+        Setting it to auto, the code will be run on the GPU if possible.
+    :param _init_setup_model: Whether or not to build the network at the creation of the instance
+    :raises ValueError: for an argument out of its range, an action space that is not a bounded Box, or, while learning,
+        an observation or reward that is NaN or infinite
+    """
+
+    presets: ClassVar[dict[str, dict[str, Any]]] = {
+        "default": {"ent_coef": 0.01, "pv_min_diff": 0.15},
+        "paper": {"ent_coef": "auto", "pv_min_diff": 0.0},
+    }
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
+        "MlpPolicy": MlpPolicy,
+        "CnnPolicy": CnnPolicy,
+        "MultiInputPolicy": MultiInputPolicy,
+    }
+
+    def __init__(
+        self,
+        policy: str | type[DSACPolicy],
+        env: GymEnv | str,
+        learning_rate: float | Schedule = 1e-4,
+        buffer_size: int = 1_000_000,  # 1e6
+        learning_starts: int = 100,
+        batch_size: int = 256,
+        tau: float = 0.005,
+        gamma: float = 0.99,
+        train_freq: int | tuple[int, str] = 1,
+        gradient_steps: int = 1,
+        action_noise: ActionNoise | None = None,
+        replay_buffer_class: type[DualReplayBuffer] | None = None,
+        replay_buffer_kwargs: dict[str, Any] | None = None,
+        optimize_memory_usage: bool = False,
+        n_steps: int = 1,
+        ent_coef: str | float | None = None,
+        target_update_interval: int = 1,
+        target_entropy: str | float = "auto",
+        ent_coef_lr: float | Schedule = 3e-4,
+        policy_delay: int = 2,
+        eta: float = 1.0,
+        tau_b: float | None = None,
+        preset: str = "default",
+        proxy_value: float = 1.0,
+        pv_coef: float = 1.0,
+        pv_min_diff: float | None = None,
+        eta_pv: float | None = None,
+        takeover_stop_td: bool = False,
+        use_sde: bool = False,
+        sde_sample_freq: int = -1,
+        use_sde_at_warmup: bool = False,
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        policy_kwargs: dict[str, Any] | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: th.device | str = "auto",
+        _init_setup_model: bool = True,
+    ):
+        super().__init__(
+            policy=policy,
+            env=env,
+            learning_rate=learning_rate,
+            buffer_size=buffer_size,
+            learning_starts=learning_starts,
+            batch_size=batch_size,
+            tau=tau,
+            gamma=gamma,
+            train_freq=train_freq,
+            gradient_steps=gradient_steps,
+            action_noise=action_noise,
+            replay_buffer_class=replay_buffer_class,
+            replay_buffer_kwargs=replay_buffer_kwargs,
+            optimize_memory_usage=optimize_memory_usage,
+            n_steps=n_steps,
+            ent_coef=ent_coef,  # type: ignore[arg-type]  # the preset replaces None
+            target_update_interval=target_update_interval,
+            target_entropy=target_entropy,
+            ent_coef_lr=ent_coef_lr,
+            policy_delay=policy_delay,
+            eta=eta,
+            tau_b=tau_b,
+            use_sde=use_sde,
+            sde_sample_freq=sde_sample_freq,
+            use_sde_at_warmup=use_sde_at_warmup,
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            policy_kwargs=policy_kwargs,
+            verbose=verbose,
+            seed=seed,
+            device=device,
+            _init_setup_model=False,
+        )
+        self.preset = preset
+        self.proxy_value = proxy_value
+        self.pv_coef = pv_coef
+        self.pv_min_diff: Any = pv_min_diff  # the preset replaces None
+        self.eta_pv = eta_pv
+        self.takeover_stop_td = takeover_stop_td
+
+        if _init_setup_model:
+            self._setup_model()
+
+    def _setup_model(self) -> None:
+        self._fill_in_preset()
+        super()._setup_model()
+
+    def _fill_in_preset(self) -> None:
+        if self.preset not in self.presets:
+            raise ValueError(f"preset must be one of {', '.join(map(repr, self.presets))}, got {self.preset!r}.")
+        for name, value in self.presets[self.preset].items():
+            if getattr(self, name) is None:
+                setattr(self, name, value)
+        if self.preset == "paper" and self.target_entropy == "auto":
+            self.target_entropy = -8.0 * float(np.prod(self.action_space.shape))  # type: ignore[arg-type]
+
+    def _check_arguments(self) -> None:
+        super()._check_arguments()
+        check_range("proxy_value", self.proxy_value, low=0.0, exclusive_low=True)
+        check_range("pv_coef", self.pv_coef, low=0.0)
+        check_range("pv_min_diff", self.pv_min_diff, low=0.0)
+        if self.eta_pv is not None:
+            check_range("eta_pv", self.eta_pv, low=0.0, exclusive_low=True)
+        if self.preset != "paper" and self._initial_ent_coef() > 0.1 * self.proxy_value:
+            warnings.warn(
+                f"ent_coef={self.ent_coef!r}: the entropy bonus will swamp the takeovers' labels of +-{self.proxy_value:g}. "
+                "Use a fixed coefficient of about 0.01 times proxy_value."
+            )
+
+    def _gradient_step(self, batch: DualReplayBufferSamples) -> dict[str, th.Tensor]:
+        ent_coef = self.log_ent_coef.detach().exp()
+        stats = self._update_proxy_critic(batch, ent_coef)
+        if self._n_updates % self.policy_delay == 0:
+            stats |= self._update_actor(self.actor, self.critic, batch.observations, ent_coef)
+            if (self._n_updates // self.policy_delay) % self.target_update_interval == 0:
+                for update in self.target_updates:
+                    update(self.tau)
+        return stats
+
+    def _update_proxy_critic(self, batch: DualReplayBufferSamples, ent_coef: th.Tensor) -> dict[str, th.Tensor]:
+        # Temporal differences without reward
+        targets = self._return_targets(self.critic_target, batch, th.zeros_like(batch.rewards.flatten()), ent_coef)
+        losses, (q_values, stds), stats = self._critic_losses(self.critic, batch, targets)
+        if self.takeover_stop_td:
+            losses = losses * (1 - batch.takeover_starts.flatten())
+        loss = losses.mean(dim=1).sum()
+
+        # Labels, on the human's rows only
+        human = batch.takeovers.flatten().nonzero().flatten()
+        if len(human) > 0:
+            q_human, std_human = q_values[:, human], stds[:, human]
+            q_novice, std_novice = self.critic(take_rows(batch.observations, human), batch.novice_actions[human])
+            differ = (batch.actions - batch.novice_actions)[human].square().mean(dim=1).sqrt() >= self.pv_min_diff
+            human_losses = self._label_losses(q_human, std_human, self.proxy_value)
+            novice_losses = self._label_losses(q_novice, std_novice, -self.proxy_value) * differ
+            loss = loss + self.pv_coef * (human_losses + novice_losses).sum() / len(batch.takeovers)
+            stats |= {"q_human": q_human.detach().mean(), "q_novice": q_novice.detach().mean()}
+        minimize(loss, self.critic.optimizer)
+        return stats
+
+    def _label_losses(self, q_values: th.Tensor, stds: th.Tensor, label: float) -> th.Tensor:
+        """
+        :return: loss of each critic and sample against a fixed target, shape of ``q_values``
+        """
+        target = th.full_like(q_values, label)
+        eta = self.eta if self.eta_pv is None else self.eta_pv
+        return gaussian_surrogate_loss(q_values, stds, target, target, self.critic.mean_std, eta)
+
+    def learn(
+        self: SelfDPVP,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 4,
+        tb_log_name: str = "DPVP",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> SelfDPVP:
+        return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
