@@ -86,6 +86,9 @@ class CHAC(DPVP):
     :param proxy_value: B, the label of the human's actions; minus B is the label of the novice's
     :param pv_coef: weight of the labels
     :param pv_min_diff: no label -B where the root mean square of a_h - a_n, both in [-1, 1], is smaller
+    :param bounded_targets: whether the targets of Z_g are clipped to [-B, B]
+    :param weight_decay: of pi_g and Z_g, relative to the learning rate (decoupled, as in AdamW)
+    :param average_tau: coefficient of the running mean of pi_g's parameters; 1 is pi_g itself
     :param eta_pv: weight of sigma^2 in the loss of the labels, ``eta`` if None
     :param takeover_stop_td: leave temporal differences out on the first step of a takeover
     :param delta: pi_r acts where P(Q_r > Q_g) is above 1 - delta. 0 leaves pi_g alone, 0.5 compares the means (the ablation
@@ -167,6 +170,9 @@ class CHAC(DPVP):
         proxy_value: float = 1.0,
         pv_coef: float = 1.0,
         pv_min_diff: float | None = None,
+        bounded_targets: bool | None = None,
+        weight_decay: float | None = None,
+        average_tau: float | None = None,
         eta_pv: float | None = None,
         takeover_stop_td: bool = False,
         delta: float = 0.15,
@@ -218,6 +224,9 @@ class CHAC(DPVP):
             proxy_value=proxy_value,
             pv_coef=pv_coef,
             pv_min_diff=pv_min_diff,
+            bounded_targets=bounded_targets,
+            weight_decay=weight_decay,
+            average_tau=average_tau,
             eta_pv=eta_pv,
             takeover_stop_td=takeover_stop_td,
             use_sde=use_sde,

@@ -7,7 +7,7 @@ from stable_baselines3.sac.policies import Actor
 
 from sb3_chac.common.critics import DistributionalCritic
 from sb3_chac.common.distributional import probability_of_improvement
-from sb3_chac.dsac.policies import DSACPolicy
+from sb3_chac.dpvp.policies import DPVPPolicy
 
 CONTROLS = ("guided", "self", "shared")
 
@@ -24,9 +24,9 @@ class Choice(NamedTuple):
     std_guided: th.Tensor
 
 
-class CHACPolicy(DSACPolicy):
+class CHACPolicy(DPVPPolicy):
     """
-    The two policies of C-HAC and what decides between them. To ``DSACPolicy`` (pi_g is its ``actor``, Z_g its ``critic``) it
+    The two policies of C-HAC and what decides between them. To ``DPVPPolicy`` (pi_g is its ``actor``, Z_g its ``critic``) it
     adds the confidence return distribution Z_c (``confidence_critic``), the self-learning policy pi_r (``self_actor``) and
     target copies of both.
 
@@ -34,7 +34,7 @@ class CHACPolicy(DSACPolicy):
 
         P(Q_r > Q_g) = Phi( (Q_c(s, a_r) - Q_c(s, a_g)) / sqrt(sigma_c(s, a_r)^2 + sigma_c(s, a_g)^2) ) > 1 - delta
 
-    and pi_g elsewhere. The parameters are those of ``DSACPolicy``, and by name:
+    and pi_g elsewhere. The parameters are those of ``DPVPPolicy``, and by name:
 
     :param delta: accepted probability that pi_r does worse, 0 (pi_g always acts) to 1
     :param sigma_scale: factor of sigma_c in the confidence
@@ -72,9 +72,9 @@ class CHACPolicy(DSACPolicy):
             target.set_training_mode(False)
 
     def start_stage_2(self) -> None:
-        """pi_r goes on from pi_g, with a fresh optimizer."""
-        self.self_actor.load_state_dict(self.actor.state_dict())
-        self.self_actor_target.load_state_dict(self.actor_target.state_dict())
+        """pi_g is its average from now on. pi_r goes on from there, with a fresh optimizer."""
+        for actor in (self.actor, self.actor_target, self.self_actor, self.self_actor_target):
+            actor.load_state_dict(self.averaged_actor.state_dict())
         self.self_actor.optimizer.state.clear()
         self.stage.fill_(2)
 
@@ -96,7 +96,7 @@ class CHACPolicy(DSACPolicy):
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         control = "guided" if self.stage == 1 else self.control
         if control == "guided":
-            return self.actor(observation, deterministic)
+            return super()._predict(observation, deterministic)
         self_actions = self.self_actor(observation, deterministic)
         if control == "self":
             return self_actions

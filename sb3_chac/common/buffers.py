@@ -1,6 +1,6 @@
 """One replay buffer with two stores: what the novice drove, and what the human drove."""
 
-from collections import deque
+from collections import defaultdict, deque
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -122,6 +122,7 @@ class DualReplayBuffer(ReplayBuffer):
             raise ValueError(
                 "optimize_memory_usage must be False: the dual replay buffer stores next observations explicitly."
             )
+        check_integer("buffer_size", buffer_size, low=1)
         check_integer("n_steps", n_steps, low=1)
         check_range("gamma", gamma, low=0.0, high=1.0)
         self.optimize_memory_usage = False
@@ -139,7 +140,7 @@ class DualReplayBuffer(ReplayBuffer):
         self.novice = TransitionStore(buffer_size, columns)
         self.human = TransitionStore(buffer_size, columns)
         # Transitions of each environment whose return is not complete yet
-        self.pending: list[deque[dict[str, Any]]] = [deque() for _ in range(n_envs)]
+        self.pending: defaultdict[int, deque[dict[str, Any]]] = defaultdict(deque)
 
     def size(self) -> int:
         """
@@ -149,10 +150,9 @@ class DualReplayBuffer(ReplayBuffer):
 
     def reset(self) -> None:
         self.novice.added = self.human.added = 0
-        for pending in self.pending:
-            pending.clear()
+        self.pending.clear()
 
-    def add(  # type: ignore[override]
+    def add(
         self,
         obs: Observation,
         next_obs: Observation,
@@ -172,8 +172,8 @@ class DualReplayBuffer(ReplayBuffer):
             row: dict[str, Any] = {
                 **self._entries("observation", obs, idx),
                 **self._entries("next_observation", next_obs, idx),
-                "action": action[idx],
-                "novice_action": info.get("novice_action", action[idx]),
+                "action": np.ravel(action[idx]),
+                "novice_action": np.ravel(info.get("novice_action", action[idx])),
                 "reward": reward[idx],
                 "discount": self.gamma,
                 "done": done[idx] and not is_timeout,
@@ -211,7 +211,7 @@ class DualReplayBuffer(ReplayBuffer):
 
     def end_trajectories(self) -> None:
         """Completes all returns with what is there, for when the environments are about to be reset."""
-        for pending in self.pending:
+        for pending in self.pending.values():
             self._flush(pending)
 
     def sample(  # type: ignore[override]

@@ -1,4 +1,4 @@
 from sb3_chac.dpvp.dpvp import DPVP
-from sb3_chac.dsac.policies import CnnPolicy, MlpPolicy, MultiInputPolicy
+from sb3_chac.dpvp.policies import CnnPolicy, MlpPolicy, MultiInputPolicy
 
 __all__ = ["DPVP", "CnnPolicy", "MlpPolicy", "MultiInputPolicy"]

@@ -11,9 +11,9 @@ from sb3_chac.common.buffers import DualReplayBuffer, DualReplayBufferSamples, t
 from sb3_chac.common.checks import check_range
 from sb3_chac.common.distributional import gaussian_surrogate_loss
 from sb3_chac.common.guided import GuidedOffPolicyAlgorithm
-from sb3_chac.common.utils import minimize
+from sb3_chac.common.utils import TargetUpdate, minimize
+from sb3_chac.dpvp.policies import CnnPolicy, DPVPPolicy, MlpPolicy, MultiInputPolicy
 from sb3_chac.dsac.dsac import DSAC
-from sb3_chac.dsac.policies import CnnPolicy, DSACPolicy, MlpPolicy, MultiInputPolicy
 
 SelfDPVP = TypeVar("SelfDPVP", bound="DPVP")
 
@@ -40,6 +40,12 @@ class DPVP(GuidedOffPolicyAlgorithm, DSAC):
     - The entropy bonus, which the novice can collect for ever by standing still, must not swamp labels of +-1 (it sums up to
       gamma alpha H / (1 - gamma)): alpha is fixed at 0.01. ``preset="paper"`` learns it from 1, towards -8 per action.
     - No -B where the novice proposed nearly what the human did (``pv_min_diff``): else both labels fall on one action.
+    - Without reward no return lies outside of [-B, B], but what Q believes of unseen actions does, and grows by bootstrapping:
+      targets are clipped (``bounded_targets``).
+    - A few thousand labels are drawn many hundred times each. A strong decay of the weights (``weight_decay``) keeps Z_g and
+      pi_g from learning them by heart.
+    - The policy differs from one thousand steps to the next. What acts when ``deterministic`` (and, in C-HAC, in stage 2) is
+      an average of its parameters over time (``average_tau``).
 
     ``preset`` fills in the arguments that are None:
 
@@ -48,6 +54,9 @@ class DPVP(GuidedOffPolicyAlgorithm, DSAC):
     ===============  =========  =======
     ent_coef         0.01       "auto"
     pv_min_diff      0.15       0
+    bounded_targets  True       False
+    weight_decay     1          0
+    average_tau      0.0005     1
     ===============  =========  =======
 
     :param policy: The policy model to use (MlpPolicy, CnnPolicy, MultiInputPolicy)
@@ -80,6 +89,9 @@ class DPVP(GuidedOffPolicyAlgorithm, DSAC):
     :param proxy_value: B, the label of the human's actions; minus B is the label of the novice's
     :param pv_coef: weight of the labels
     :param pv_min_diff: no label -B where the root mean square of a_h - a_n, both in [-1, 1], is smaller
+    :param bounded_targets: whether the targets of Z_g are clipped to [-B, B]
+    :param weight_decay: of pi_g and Z_g, relative to the learning rate (decoupled, as in AdamW)
+    :param average_tau: coefficient of the running mean of pi_g's parameters; 1 is pi_g itself
     :param eta_pv: weight of sigma^2 in the loss of the labels, ``eta`` if None
     :param takeover_stop_td: leave temporal differences out on the first step of a takeover
     :param use_sde: Whether to use generalized State Dependent Exploration (gSDE)
@@ -103,18 +115,32 @@ class DPVP(GuidedOffPolicyAlgorithm, DSAC):
     """
 
     presets: ClassVar[dict[str, dict[str, Any]]] = {
-        "default": {"ent_coef": 0.01, "pv_min_diff": 0.15},
-        "paper": {"ent_coef": "auto", "pv_min_diff": 0.0},
+        "default": {
+            "ent_coef": 0.01,
+            "pv_min_diff": 0.15,
+            "bounded_targets": True,
+            "weight_decay": 1.0,
+            "average_tau": 5e-4,
+        },
+        "paper": {
+            "ent_coef": "auto",
+            "pv_min_diff": 0.0,
+            "bounded_targets": False,
+            "weight_decay": 0.0,
+            "average_tau": 1.0,
+        },
     }
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
         "MlpPolicy": MlpPolicy,
         "CnnPolicy": CnnPolicy,
         "MultiInputPolicy": MultiInputPolicy,
     }
+    required_policy = DPVPPolicy
+    policy: DPVPPolicy
 
     def __init__(
         self,
-        policy: str | type[DSACPolicy],
+        policy: str | type[DPVPPolicy],
         env: GymEnv | str,
         learning_rate: float | Schedule = 1e-4,
         buffer_size: int = 1_000_000,  # 1e6
@@ -140,6 +166,9 @@ class DPVP(GuidedOffPolicyAlgorithm, DSAC):
         proxy_value: float = 1.0,
         pv_coef: float = 1.0,
         pv_min_diff: float | None = None,
+        bounded_targets: bool | None = None,
+        weight_decay: float | None = None,
+        average_tau: float | None = None,
         eta_pv: float | None = None,
         takeover_stop_td: bool = False,
         use_sde: bool = False,
@@ -190,7 +219,11 @@ class DPVP(GuidedOffPolicyAlgorithm, DSAC):
         self.preset = preset
         self.proxy_value = proxy_value
         self.pv_coef = pv_coef
-        self.pv_min_diff: Any = pv_min_diff  # the preset replaces None
+        # The preset replaces None
+        self.pv_min_diff: Any = pv_min_diff
+        self.bounded_targets: Any = bounded_targets
+        self.weight_decay: Any = weight_decay
+        self.average_tau: Any = average_tau
         self.eta_pv = eta_pv
         self.takeover_stop_td = takeover_stop_td
 
@@ -200,6 +233,10 @@ class DPVP(GuidedOffPolicyAlgorithm, DSAC):
     def _setup_model(self) -> None:
         self._fill_in_preset()
         super()._setup_model()
+        self.average_update = TargetUpdate(self.actor, self.policy.averaged_actor)
+        for optimizer in (self.actor.optimizer, self.critic.optimizer):
+            for group in optimizer.param_groups:
+                group["weight_decay"] = self.weight_decay
 
     def _fill_in_preset(self) -> None:
         if self.preset not in self.presets:
@@ -215,6 +252,8 @@ class DPVP(GuidedOffPolicyAlgorithm, DSAC):
         check_range("proxy_value", self.proxy_value, low=0.0, exclusive_low=True)
         check_range("pv_coef", self.pv_coef, low=0.0)
         check_range("pv_min_diff", self.pv_min_diff, low=0.0)
+        check_range("weight_decay", self.weight_decay, low=0.0)
+        check_range("average_tau", self.average_tau, low=0.0, high=1.0)
         if self.eta_pv is not None:
             check_range("eta_pv", self.eta_pv, low=0.0, exclusive_low=True)
         if self.preset != "paper" and self._initial_ent_coef() > 0.1 * self.proxy_value:
@@ -231,11 +270,16 @@ class DPVP(GuidedOffPolicyAlgorithm, DSAC):
             if (self._n_updates // self.policy_delay) % self.target_update_interval == 0:
                 for update in self.target_updates:
                     update(self.tau)
+            n_actor_updates = self._n_updates // self.policy_delay
+            self.average_update(max(self.average_tau, 1 / n_actor_updates))
         return stats
 
     def _update_proxy_critic(self, batch: DualReplayBufferSamples, ent_coef: th.Tensor) -> dict[str, th.Tensor]:
         # Temporal differences without reward
         targets = self._return_targets(self.critic_target, batch, th.zeros_like(batch.rewards.flatten()), ent_coef)
+        if self.bounded_targets:
+            mean_targets, sampled_targets = (target.clamp(-self.proxy_value, self.proxy_value) for target in targets)
+            targets = mean_targets, sampled_targets
         losses, (q_values, stds), stats = self._critic_losses(self.critic, batch, targets)
         if self.takeover_stop_td:
             losses = losses * (1 - batch.takeover_starts.flatten())
@@ -272,3 +316,6 @@ class DPVP(GuidedOffPolicyAlgorithm, DSAC):
         progress_bar: bool = False,
     ) -> SelfDPVP:
         return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "average_update"]

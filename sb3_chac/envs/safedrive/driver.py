@@ -25,7 +25,8 @@ ACCELERATIONS = np.array([-4.0, -2.5, -1.2, 0.0, 1.2, 2.5])  # [m/s2]
 TIMES = 0.3 * np.arange(1, 13)  # [s] of the prediction
 FEARED = 0.125 * np.arange(1, 21)  # [s] of the prediction of what the novice does
 COUNTER_STEERING = 5.0  # [m/s2] with which a vehicle is straightened out
-STALLED_FOR, BOXED_IN_FOR = 3.0, 8.0  # [s]
+PATIENCE, BOXED_IN_FOR = 3.0, 8.0  # [s]
+DAWDLING = 0.4  # of the speed that the road allows
 IMPERFECTIONS = {
     "scripted": dict(reaction_delay=3, action_noise=0.1),
     "scripted-ideal": dict(reaction_delay=0, action_noise=0.0),
@@ -77,7 +78,7 @@ class ScriptedDriver:
         self.noise = np.zeros(2)
         self.seen: deque[Others] = deque(maxlen=self.reaction_delay + 1)
         self.boxed_in = 0.0  # [s] of standing
-        self.stalled = 0.0  # [s] in which the ego stands although the driver would go
+        self.dawdled = 0.0  # [s] in which the ego stands or crawls although the driver would speed up
 
     def __call__(self, observation: np.ndarray | None = None) -> np.ndarray:
         """
@@ -88,7 +89,7 @@ class ScriptedDriver:
         target, slope, acceleration, cap = self._plan(self.seen[0])
         ego = self.env.ego
         self.boxed_in = self.boxed_in + 0.1 if ego.speed < 0.3 else max(0.0, self.boxed_in - 0.05)
-        self.stalled = self.stalled + 0.1 if ego.speed < 0.5 and acceleration > 0 else 0.0
+        self.dawdled = self.dawdled + 0.1 if ego.speed < DAWDLING * cap and acceleration > 0 else 0.0
         if acceleration > 0:
             acceleration = min(acceleration, 1.5 * (cap - ego.speed))
         elif ego.speed < 1.0:
@@ -101,13 +102,13 @@ class ScriptedDriver:
         """
         What a human beside the novice fears: that the vehicle leaves the road, if the steering is held for 0.6 s and follows
         the road from then on; that it comes too close to something to brake in time, if the acceleration is held; that it
-        stands although it could go.
+        stands or crawls although it could go.
 
         :param observation: not used
         :param action: steering and acceleration, shape (2,), in [-1, 1]
         :return: [s] until it is too late, up to 2.5; inf if nothing threatens
         """
-        if self.stalled > STALLED_FOR:
+        if self.dawdled > PATIENCE:
             return 0.0
         env, ego = self.env, self.env.ego
         states = self._roll_out(float(action[0]) * MAX_STEERING, float(action[1]) * MAX_ACCELERATION)
