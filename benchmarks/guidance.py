@@ -2,21 +2,27 @@
 
     python benchmarks/guidance.py run --jobs 2     # runs what is missing; stop and restart it at any time
     python benchmarks/guidance.py report           # prints the tables and draws the curves from the CSVs
+    python benchmarks/guidance.py agents           # copies one trained agent per method to benchmarks/agents/
 
 Hyperparameters are those of ``hyperparams/<algo>.yml``. Training maps 100-119; every evaluation is one deterministic episode
-on each of the maps 1000-1049, without the human. Seeds 0-2 are the reported ones; tune on seeds from 100 and maps from 2000.
-One CSV per run is written to benchmarks/results/guidance/, a row per evaluation as it comes.
+on each of the maps 1000-1049, without the human. Seeds 0-2 are the reported ones; tuning is done on seeds from 100 and maps
+2000-2049. C-HAC and its ablations share their stage 1.
+One CSV per run is written to benchmarks/results/guidance/, a row per evaluation as it comes; a run that was cut off starts
+anew. Models go to --models.
 """
 
 import argparse
 import csv
 import importlib.metadata
+import json
 import multiprocessing
+import shutil
 import time
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
 import torch as th
 import yaml
 from rl_zoo3.utils import ALGOS, get_wrapper_class
@@ -27,15 +33,35 @@ from stable_baselines3.common.env_util import make_vec_env
 from sb3_chac.common.evaluation import evaluate
 from sb3_chac.zoo.registration import hyperparams_file
 
-RESULTS = Path(__file__).parent / "results" / "guidance"
+HERE = Path(__file__).parent
+RESULTS = HERE / "results" / "guidance"
 VERSIONS = " ".join(
     f"{name}={importlib.metadata.version(name)}"
     for name in ("torch", "stable-baselines3", "gymnasium", "highway-env", "numpy")
 )
 TEST_MAPS, TUNING_MAPS = range(1000, 1050), range(2000, 2050)
-FIRST_REPORTED_SEED, FIRST_TUNING_SEED = 0, 100
-# Method -> algorithm, steps
-METHODS = {"sac": ("sac", 200_000), "dsac": ("dsac", 200_000), "pvp": ("pvp", 50_000), "dpvp": ("dpvp", 50_000), "chac": ("chac", 200_000)}
+FIRST_TUNING_SEED = 100
+SWITCH = 50_000
+
+
+class Method(NamedTuple):
+    algo: str
+    steps: int
+    title: str
+    overrides: dict[str, Any] = {}  # noqa: RUF012
+    goes_on_from: str | None = None  # the method whose last state it starts with
+
+
+METHODS = {
+    "sac": Method("sac", 200_000, "SAC"),
+    "dsac": Method("dsac", 200_000, "DSAC"),
+    "pvp": Method("pvp", SWITCH, "PVP"),
+    "dpvp": Method("dpvp", SWITCH, "D-PVP"),
+    "chac-stage-1": Method("chac", SWITCH, "C-HAC, end of stage 1"),
+    "chac": Method("chac", 200_000, "C-HAC", {}, "chac-stage-1"),
+    "chac-no-share": Method("chac", 200_000, "C-HAC, No Share", {"shared_control": False}, "chac-stage-1"),
+    "chac-no-confidence": Method("chac", 200_000, "C-HAC, No Confidence", {"delta": 0.5}, "chac-stage-1"),
+}
 
 
 def make_model(algo: str, seed: int, **overrides: Any) -> BaseAlgorithm:
@@ -44,58 +70,60 @@ def make_model(algo: str, seed: int, **overrides: Any) -> BaseAlgorithm:
     del params["n_timesteps"]
     wrapper = get_wrapper_class(params)
     params.pop("env_wrapper", None)
-    params["policy_kwargs"] = {
-        **eval(params.get("policy_kwargs", "dict()"), {"dict": dict}),
-        # The default of our policies; for SAC it changes the speed, not the result
-        "optimizer_kwargs": {"fused": True},
-    }
+    policy_kwargs = eval(params.get("policy_kwargs", "dict()"), {"dict": dict, "th": th})
+    if algo == "sac":  # the default of our policies; it changes the speed, not the result
+        policy_kwargs["optimizer_kwargs"] = {"fused": True}
     env = make_vec_env("SafeDrive-v0", seed=seed, wrapper_class=wrapper)
-    return ALGOS[algo](env=env, seed=seed, device="cpu", **params | overrides)
+    return ALGOS[algo](env=env, seed=seed, device="cpu", **params | {"policy_kwargs": policy_kwargs} | overrides)
 
 
 class Record(BaseCallback):
     """Sums up the safety cost of the training, and appends a row to the CSV at each evaluation."""
 
-    def __init__(self, path: Path, labels: dict[str, Any], every: int, maps: range):
+    def __init__(self, path: Path, labels: dict[str, Any], every: int, maps: range, training_cost: float):
         super().__init__()
         self.path, self.labels, self.every, self.maps = path, labels, every, maps
-        self.training_cost = self.training_cost_human = 0.0
-        self.human_steps = 0
+        self.training_cost = training_cost
 
     def _on_step(self) -> bool:
-        for info in self.locals["infos"]:
-            self.training_cost += info["cost"]
-            self.training_cost_human += info["cost"] * info.get("takeover", False)
-            self.human_steps += info.get("takeover", False)
+        self.training_cost += sum(info["cost"] for info in self.locals["infos"])
         if self.num_timesteps % self.every == 0:
-            self.write()
+            summary = evaluate(self.model, "SafeDrive-v0", self.maps).summary()
+            counts = getattr(self.model, "counts", {})
+            row = {**self.labels, "step": self.num_timesteps, **{key: round(value, 4) for key, value in summary.items()}}
+            row |= {"human_steps": int(counts.get("human_steps", 0)), "training_cost": int(self.training_cost)}
+            row |= {"training_cost_human": int(counts.get("safety_cost_human", 0))}
+            row |= {"cpu_seconds": round(time.process_time()), "versions": VERSIONS}
+            is_new = not self.path.exists()
+            with self.path.open("a", newline="") as file:
+                writer = csv.DictWriter(file, list(row))
+                if is_new:
+                    writer.writeheader()
+                writer.writerow(row)
         return True
 
-    def write(self) -> None:
-        summary = evaluate(self.model, "SafeDrive-v0", self.maps).summary()
-        row = {**self.labels, "step": self.num_timesteps, **{key: round(value, 4) for key, value in summary.items()}}
-        row |= {"human_steps": self.human_steps, "training_cost": self.training_cost}
-        row |= {"training_cost_human": self.training_cost_human, "cpu_seconds": round(time.process_time())}
-        row["versions"] = VERSIONS
-        is_new = not self.path.exists()
-        with self.path.open("a", newline="") as file:
-            writer = csv.DictWriter(file, list(row))
-            if is_new:
-                writer.writeheader()
-            writer.writerow(row)
 
-
-def run(method: str, seed: int, every: int, folder: Path) -> str:
+def run(name: str, seed: int, every: int, results: Path, models: Path) -> str:
     th.set_num_threads(1)
-    algo, steps = METHODS[method]
-    path = folder / f"{method}-{seed}.csv"
+    method = METHODS[name]
+    path = results / f"{name}-{seed}.csv"
     path.unlink(missing_ok=True)
-    folder.mkdir(parents=True, exist_ok=True)
-    model = make_model(algo, seed)
+    for folder in (results, models):
+        folder.mkdir(parents=True, exist_ok=True)
+    model = make_model(method.algo, seed)
+    training_cost = 0.0
+    if method.goes_on_from is not None:
+        start = models / f"{method.goes_on_from}-{seed}.zip"
+        model = type(model).load(start, env=model.get_env(), device="cpu", **method.overrides)
+        model.load_replay_buffer(start.with_suffix(".pkl"))
+        training_cost = model.counts["safety_cost"]
     maps = TUNING_MAPS if seed >= FIRST_TUNING_SEED else TEST_MAPS
-    model.learn(steps, callback=Record(path, {"method": method, "seed": seed}, every, maps))
-    model.save(folder / f"{method}-{seed}.zip")
-    return f"{method} seed {seed}: {time.process_time():.0f} CPU seconds"
+    record = Record(path, {"method": name, "seed": seed}, every, maps, training_cost)
+    model.learn(method.steps - model.num_timesteps, callback=record, reset_num_timesteps=method.goes_on_from is None)
+    model.save(models / f"{name}-{seed}.zip")
+    if any(other.goes_on_from == name for other in METHODS.values()):
+        model.save_replay_buffer(models / f"{name}-{seed}.pkl")
+    return f"{name} seed {seed}: {time.process_time():.0f} CPU seconds"
 
 
 def read(path: Path) -> list[dict[str, str]]:
@@ -103,26 +131,94 @@ def read(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
+def is_finished(path: Path, method: Method) -> bool:
+    return path.exists() and int(read(path)[-1]["step"]) >= method.steps
+
+
 def run_all(args: argparse.Namespace) -> None:
-    jobs = []
-    for seed in args.seeds:
-        for method in args.methods:
-            path = args.folder / f"{method}-{seed}.csv"
-            if not path.exists() or int(read(path)[-1]["step"]) < METHODS[method][1]:
-                jobs.append((method, seed, args.every, args.folder))
+    def missing(go_on: bool) -> list[tuple[str, int]]:
+        return [
+            (name, seed)
+            for seed in args.seeds
+            for name in args.methods
+            if (METHODS[name].goes_on_from is not None) == go_on
+            and not is_finished(args.results / f"{name}-{seed}.csv", METHODS[name])
+        ]
+
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(args.jobs, mp_context=context, max_tasks_per_child=1) as pool:
-        for future in as_completed([pool.submit(run, *job) for job in jobs]):
-            print(future.result(), flush=True)
+    for go_on in (False, True):  # from what the first round leaves
+        with ProcessPoolExecutor(args.jobs, mp_context=context, max_tasks_per_child=1) as pool:
+            futures = [pool.submit(run, *job, args.every, args.results, args.models) for job in missing(go_on)]
+            for future in as_completed(futures):
+                print(future.result(), flush=True)
+
+
+def columns(runs: list[list[dict[str, str]]], key: str) -> np.ndarray:
+    """
+    :return: shape (n_runs, n_evaluations)
+    """
+    return np.array([[float(row[key]) for row in rows] for rows in runs])
+
+
+def report(args: argparse.Namespace) -> None:
+    """Table: last three evaluations, mean ± standard deviation over seeds. Curves: mean, shaded from least to greatest."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    figure, axes = plt.subplots(1, 4, figsize=(16, 3.4))
+    titles = {"success_rate": "success rate", "cost_mean": "safety cost", "return_mean": "return"}
+    print("| method | seeds | steps | human steps | return | cost | success | training cost |")
+    print("|---|---|---|---|---|---|---|---|")
+    rows = []
+    for name, method in METHODS.items():
+        paths = [args.results / f"{name}-{seed}.csv" for seed in args.seeds]
+        runs = [read(path) for path in paths if is_finished(path, method)]
+        if not runs:
+            continue
+        scores = {key: columns(runs, key)[:, -3:].mean(axis=1) for key in titles}
+        scores |= {key: columns(runs, key)[:, -1] for key in ("human_steps", "training_cost")}
+        text = {key: f"{s.mean():.2f}" + (f" ± {s.std(ddof=1):.2f}" if len(s) > 1 else "") for key, s in scores.items()}
+        whole = {key: f"{scores[key].mean():.0f}" for key in ("human_steps", "training_cost")}
+        print(
+            f"| {method.title} | {len(runs)} | {method.steps // 1000}K | {whole['human_steps']} | {text['return_mean']} "
+            f"| {text['cost_mean']} | {text['success_rate']} | {whole['training_cost']} |"
+        )
+        rows.append({"method": name, "seeds": len(runs), **{key: float(s.mean()) for key, s in scores.items()}})
+        steps = columns(runs, "step")[0]
+        for axis, key in zip(axes, [*titles, "training_cost"], strict=True):
+            curves = columns(runs, key)
+            (line,) = axis.plot(steps, curves.mean(axis=0), label=method.title)
+            axis.fill_between(steps, curves.min(axis=0), curves.max(axis=0), color=line.get_color(), alpha=0.12)
+            axis.set(title=titles.get(key, "safety cost of the training"), xlabel="environment steps")
+    axes[0].legend(fontsize=7)
+    figure.tight_layout()
+    figure.savefig(args.results / "curves.png", dpi=90)
+    (args.results / "summary.json").write_text(json.dumps(rows, indent=2) + "\n")
+
+
+def agents(args: argparse.Namespace) -> None:
+    """Of each method, the seed whose last evaluation is the median of the returns."""
+    folder = HERE / "agents"
+    folder.mkdir(exist_ok=True)
+    for name, method in METHODS.items():
+        seeds = [seed for seed in args.seeds if is_finished(args.results / f"{name}-{seed}.csv", method)]
+        if seeds and name in ("sac", "dsac", "pvp", "dpvp", "chac"):
+            seeds.sort(key=lambda seed: float(read(args.results / f"{name}-{seed}.csv")[-1]["return_mean"]))
+            chosen = seeds[(len(seeds) - 1) // 2]
+            shutil.copy(args.models / f"{name}-{chosen}.zip", folder / f"{name}-SafeDrive-v0.zip")
+            print(f"{name}: seed {chosen}")
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("command", choices=["run"])
+    parser.add_argument("command", choices=["run", "report", "agents"])
     parser.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS))
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
     parser.add_argument("--every", type=int, default=10_000, help="steps between evaluations")
     parser.add_argument("--jobs", type=int, default=2, help="processes at once, one torch thread each")
-    parser.add_argument("--folder", type=Path, default=RESULTS)
+    parser.add_argument("--results", type=Path, default=RESULTS)
+    parser.add_argument("--models", type=Path, default=HERE / "models", help="not committed")
     arguments = parser.parse_args()
-    run_all(arguments)
+    {"run": run_all, "report": report, "agents": agents}[arguments.command](arguments)

@@ -5,13 +5,14 @@ RL-Zoo3's are for places where the stock ``rl_zoo3`` command does not find them 
 
 import sys
 
-COMMANDS = ("train", "enjoy", "plot_train", "plot_from_file", "all_plots", "evaluate")
-
+COMMANDS = ("train", "enjoy", "plot_train", "plot_from_file", "all_plots", "evaluate", "resume")
 
 USAGE = f"""usage: sb3-chac {{{",".join(COMMANDS)}}} ...
 
-RL-Zoo3's commands with the algorithms of sb3_chac, and 'evaluate' for a model or an expert on held-out scenarios:
-'sb3-chac train --help' lists the arguments."""
+RL-Zoo3's commands with the algorithms of sb3_chac, and
+  evaluate MODEL.zip    a model or an expert on held-out scenarios
+  resume RUN_FOLDER     go on with a training that was interrupted or killed, from its newest checkpoint
+'sb3-chac train --help' lists the arguments, so does --help of the others."""
 
 
 def main() -> None:
@@ -25,6 +26,11 @@ def main() -> None:
         from sb3_chac.evaluate import main as evaluate
 
         evaluate(sys.argv[2:])
+        return
+    if command == "resume":
+        from sb3_chac.resume import main as resume
+
+        resume(sys.argv[2:])
         return
 
     from rl_zoo3.cli import main as zoo_main

@@ -34,9 +34,11 @@ def test_train_leaves_what_the_zoo_promises(trained):
     assert dict(saved)["learning_rate"] == 0.001  # ours, not the zoo's default
 
 
-@pytest.mark.parametrize("algo", ["dsac", "sac", "ppo"])
+@pytest.mark.parametrize("algo", ["dsac", "pvp", "dpvp", "chac", "sac", "ppo"])
 def test_our_environment(tmp_path, algo):
-    few = ["-params", "n_steps:64", "batch_size:64"] if algo == "ppo" else []
+    few = {"ppo": ["-params", "n_steps:64", "batch_size:64"], "chac": ["-params", "switch_after:100", "prefit_steps:5"]}.get(
+        algo, []
+    )
     quick = ["--env", "SafeDrive-v0", "-n", "200", "--eval-freq", "100", "--eval-episodes", "1", "-f", "logs"]
     output = run(ZOO, "train", "--algo", algo, *quick, *few, "--env-kwargs", "horizon:60", "blocks:2", cwd=tmp_path)
     assert str(hyperparams_file(algo)) in output and "Saving to" in output
@@ -45,6 +47,68 @@ def test_our_environment(tmp_path, algo):
         sys.executable, "-m", "sb3_chac", "evaluate", run_folder / "SafeDrive-v0.zip", "--scenarios", "1000:1002", cwd=tmp_path
     )
     assert "safety cost" in output
+
+
+def test_nobody_drives_in_evaluations_which_have_maps_of_their_own(tmp_path, monkeypatch):
+    from rl_zoo3.train import train
+
+    from sb3_chac import InterventionWrapper
+
+    steps: dict[str, list[tuple[bool, bool, int]]] = {"training": [], "evaluation": []}
+    original = InterventionWrapper.step
+
+    def step(self, action):
+        *result, info = original(self, action)
+        kind = "training" if self.unwrapped.start_scenario == 100 else "evaluation"
+        assert self.unwrapped.horizon == 60
+        steps[kind].append((self.armed, info["takeover"], info["scenario"]))
+        return *result, info
+
+    monkeypatch.setattr(InterventionWrapper, "step", step)
+    monkeypatch.chdir(tmp_path)
+    command = [
+        "--algo",
+        "dpvp",
+        "--env",
+        "SafeDrive-v0",
+        "-n",
+        "240",
+        "--eval-freq",
+        "80",
+        "--eval-episodes",
+        "2",
+        "--seed",
+        "1",
+    ]
+    options = ["--env-kwargs", "horizon:60", "blocks:2", *SMALL]
+    monkeypatch.setattr(sys, "argv", ["rl_zoo3", *command, *options])
+    train()
+    armed, takeovers, scenarios = map(set, zip(*steps["evaluation"], strict=True))
+    assert armed == takeovers == {False} and len(steps["evaluation"]) > 100
+    assert min(scenarios) >= 2000 and max(scenarios) <= 2049
+    armed, takeovers, scenarios = map(set, zip(*steps["training"], strict=True))
+    assert armed == {True} and takeovers == {True, False} and len(steps["training"]) == 240
+    assert min(scenarios) >= 100 and max(scenarios) <= 119
+
+
+@pytest.mark.parametrize(
+    "own, expected",
+    [
+        ([], {"start_scenario": 2000, "num_scenarios": 50}),
+        (["--env-kwargs", "start_scenario:500", "blocks:1"], {"start_scenario": 2000, "num_scenarios": 50, "blocks": 1}),
+        (["--eval-env-kwargs", "start_scenario:3000"], {"start_scenario": 3000}),
+    ],
+)
+def test_maps_of_evaluations(tmp_path, monkeypatch, own, expected):
+    from rl_zoo3 import train as zoo
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(zoo.ExperimentManager, "learn", lambda *_: None)
+    managers = []
+    monkeypatch.setattr(zoo.ExperimentManager, "save_trained_model", lambda manager, _: managers.append(manager))
+    monkeypatch.setattr(sys, "argv", ["rl_zoo3", "--algo", "sac", "--env", "SafeDrive-v0", *own])
+    zoo.train()
+    assert managers[0].eval_env_kwargs == expected
 
 
 def test_enjoy(trained):
@@ -57,6 +121,18 @@ def test_continue_training_with_the_replay_buffer(trained):
     output = run(ZOO, "train", "--algo", "dsac", *QUICK, "-i", model, *SMALL, cwd=trained)
     assert "Loading pretrained agent" in output and "Loading replay buffer" in output
     assert (trained / "logs" / "dsac" / "Pendulum-v1_2" / "Pendulum-v1.zip").is_file()
+
+
+@pytest.mark.parametrize("algo", ["pvp", "dpvp", "chac"])
+def test_optimize_on_our_environment(tmp_path, algo):
+    search = ["-optimize", "--n-trials", "2", "--n-startup-trials", "2", "--n-evaluations", "1", "--no-optim-plots"]
+    quick = ["--env", "SafeDrive-v0", "-n", "200", "--eval-episodes", "1", "--env-kwargs", "horizon:60", "blocks:2"]
+    params = ["-params", "learning_starts:50", *(["switch_after:100", "prefit_steps:5"] if algo == "chac" else [])]
+    output = run(ZOO, "train", "--algo", algo, *quick, *search, *params, cwd=tmp_path)
+    assert "Number of finished trials:  2" in output
+    assert output.count("finished with value") == 2  # RL-Zoo3 turns errors into pruned trials
+    assert "'start_scenario': 2000" in output
+    assert not list(tmp_path.rglob("checkpoints"))
 
 
 def test_optimize_and_train_the_best_trial(tmp_path):

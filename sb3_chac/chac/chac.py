@@ -3,6 +3,7 @@ from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch as th
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
@@ -43,6 +44,8 @@ class CHAC(DPVP):
     - Z_c is far from converged at the switch: it follows its target faster (``tau_c``) and is fitted to both stores first
       (``prefit_steps``).
     - In stage 2, Z_c bootstraps on what is executed, not on pi_r alone (``bootstrap``).
+    - pi_r exploits what Z_c believes of actions that nobody has tried, and leaves the road in most episodes after the switch.
+      It is tied to pi_g: it maximises Q_c - alpha log pi_r - anchor_coef ||a_r - a_g||^2 (``anchor_coef``).
 
     ``preset`` fills in the arguments that are None, those of ``DPVP`` and:
 
@@ -54,6 +57,7 @@ class CHAC(DPVP):
     prefit_steps        5000        0
     bootstrap           "executed"  "self"
     stage2_human_share  0.25        0
+    anchor_coef         20          0
     ==================  ==========  =======
 
     :param policy: The policy model to use (MlpPolicy, CnnPolicy, MultiInputPolicy)
@@ -104,6 +108,8 @@ class CHAC(DPVP):
     :param prefit_steps: gradient steps of Z_c, on both stores, at the switch
     :param bootstrap: "executed": Z_c evaluates what is executed in stage 2 (shared control); "self": pi_r
     :param stage2_human_share: share of the human's transitions in the batches of stage 2
+    :param anchor_coef: weight of the squared distance between the actions of pi_r and pi_g, both in [-1, 1], in pi_r's loss;
+        in units of the return
     :param use_sde: Whether to use generalized State Dependent Exploration (gSDE)
         instead of action noise exploration (default: False)
     :param sde_sample_freq: Sample a new noise matrix every n steps when using gSDE
@@ -126,9 +132,16 @@ class CHAC(DPVP):
 
     presets: ClassVar[dict[str, dict[str, Any]]] = {
         "default": DPVP.presets["default"]
-        | {"sigma_scale": 0.08, "tau_c": 0.02, "prefit_steps": 5000, "bootstrap": "executed", "stage2_human_share": 0.25},
+        | {
+            "sigma_scale": 0.08,
+            "tau_c": 0.02,
+            "prefit_steps": 5000,
+            "bootstrap": "executed",
+            "stage2_human_share": 0.25,
+            "anchor_coef": 20.0,
+        },
         "paper": DPVP.presets["paper"]
-        | {"sigma_scale": 1.0, "prefit_steps": 0, "bootstrap": "self", "stage2_human_share": 0.0},
+        | {"sigma_scale": 1.0, "prefit_steps": 0, "bootstrap": "self", "stage2_human_share": 0.0, "anchor_coef": 0.0},
     }
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
         "MlpPolicy": MlpPolicy,
@@ -186,6 +199,7 @@ class CHAC(DPVP):
         prefit_steps: int | None = None,
         bootstrap: str | None = None,
         stage2_human_share: float | None = None,
+        anchor_coef: float | None = None,
         use_sde: bool = False,
         sde_sample_freq: int = -1,
         use_sde_at_warmup: bool = False,
@@ -252,6 +266,7 @@ class CHAC(DPVP):
         self.prefit_steps: Any = prefit_steps
         self.bootstrap: Any = bootstrap
         self.stage2_human_share: Any = stage2_human_share
+        self.anchor_coef: Any = anchor_coef
 
         if _init_setup_model:
             self._setup_model()
@@ -296,6 +311,22 @@ class CHAC(DPVP):
     def _needs_human(self) -> bool:
         return self.stage == 1
 
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        reset_num_timesteps: bool = True,
+        tb_log_name: str = "run",
+        progress_bar: bool = False,
+    ) -> tuple[int, BaseCallback]:
+        prepared = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
+        self._show_stage()
+        return prepared
+
+    def _show_stage(self) -> None:
+        if self.env is not None and self.env.has_attr("set_stage"):
+            self.env.env_method("set_stage", self.stage)
+
     def _optimizers(self) -> list[th.optim.Optimizer]:
         return [*super()._optimizers(), self.confidence_critic.optimizer, self.self_actor.optimizer]
 
@@ -309,7 +340,15 @@ class CHAC(DPVP):
         stats = self._update_confidence_critic(batch)
         if self._n_updates % self.policy_delay == 0:
             ent_coef = self.log_ent_coef.detach().exp()
-            stats |= self._update_actor(self.self_actor, self.confidence_critic, batch.observations, ent_coef)
+            with th.no_grad():
+                guided_actions = self.actor(batch.observations, deterministic=True)
+            stats |= self._update_actor(
+                self.self_actor,
+                self.confidence_critic,
+                batch.observations,
+                ent_coef,
+                lambda actions: self.anchor_coef * (actions - guided_actions).square().sum(dim=1),
+            )
             self.self_update(self.tau)
         return stats
 
@@ -361,8 +400,7 @@ class CHAC(DPVP):
             self._update_confidence_critic(super()._sample_batch(self.batch_size))
         self.policy.set_training_mode(False)
         self.policy.start_stage_2()
-        if self.env is not None and self.env.has_attr("set_stage"):
-            self.env.env_method("set_stage", 2)
+        self._show_stage()
         if self.verbose > 0:
             human_steps = int(self.counts["human_steps"])
             print(f"C-HAC: stage 2 begins at step {self.num_timesteps}, after {human_steps} steps of the human")

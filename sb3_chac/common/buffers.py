@@ -224,6 +224,8 @@ class DualReplayBuffer(ReplayBuffer):
             taken from the other one
         :raises ValueError: if the buffer is empty
         """
+        if self.size() == 0:  # better short returns than none
+            self.end_trajectories()
         n_human = round(human_share * batch_size)
         if len(self.human) < n_human:
             n_human = 0

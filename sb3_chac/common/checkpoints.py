@@ -99,8 +99,8 @@ class ResumableCheckpoint(BaseCallback):
 
 class SparseWriter(io.BufferedWriter):
     """
-    A file in which blocks of zeros are left out (they are read as zeros): SB3's ReplayBuffer is stored with the rows that are not
-    in use yet, which may be gigabytes. The last byte written must not be zero; that of a pickle never is.
+    A file in which blocks of zeros are left out (they are read as zeros): SB3's ReplayBuffer is stored with the rows that are
+    not in use yet, which may be gigabytes. The last byte written must not be zero; that of a pickle never is.
     """
 
     def write(self, data: Any) -> int:

@@ -1,5 +1,7 @@
 """What the algorithms that learn from takeovers share: asking the human, storing who drove, counting."""
 
+import io
+import pathlib
 import warnings
 from collections import deque
 from typing import Any, TypeVar
@@ -77,8 +79,10 @@ class GuidedOffPolicyAlgorithm(CheckedOffPolicyAlgorithm):
         progress_bar: bool = False,
     ) -> tuple[int, BaseCallback]:
         self.replay_buffer.end_trajectories()
-        self._forget_episodes()
+        if reset_num_timesteps or self._last_obs is None:  # the environments are about to be reset
+            self._forget_episodes()
         prepared = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
+        self._restore_wrappers()
         if self._needs_human():
             self._arm()
         return prepared
@@ -103,8 +107,21 @@ class GuidedOffPolicyAlgorithm(CheckedOffPolicyAlgorithm):
         self._disarm()
         return self
 
+    def _restore_wrappers(self) -> None:
+        """Wrappers that are new go on with the counts of those before them."""
+        assert self.env is not None
+        if not self.wrapper_states or not self.env.has_attr("load_state_dict"):
+            return
+        if len(self.wrapper_states) != self.n_envs:  # another number of environments than before: deal out the sums
+            sums = {name: sum(state[name] for state in self.wrapper_states) for name in self.wrapper_states[0]}
+            self.wrapper_states = [
+                {name: (total + idx) // self.n_envs for name, total in sums.items()} for idx in range(self.n_envs)
+            ]
+        for idx, state in enumerate(self.wrapper_states):
+            self.env.env_method("load_state_dict", state, indices=idx)
+
     def _arm(self) -> None:
-        """Ask the human from now on. Wrappers that are new go on with the counts of those before them."""
+        """Ask the human from now on."""
         assert self.env is not None
         if not self.env.has_attr("arm"):
             warnings.warn(
@@ -112,18 +129,23 @@ class GuidedOffPolicyAlgorithm(CheckedOffPolicyAlgorithm):
                 "sb3_chac.InterventionWrapper (RL-Zoo3: env_wrapper), or report takeovers in info['intervene_action']."
             )
             return
-        if len(self.wrapper_states) not in (0, self.n_envs):  # another number of environments than before: deal out the sums
-            sums = {name: sum(state[name] for state in self.wrapper_states) for name in self.wrapper_states[0]}
-            self.wrapper_states = [
-                {name: (total + idx) // self.n_envs for name, total in sums.items()} for idx in range(self.n_envs)
-            ]
-        for idx, state in enumerate(self.wrapper_states):
-            self.env.env_method("load_state_dict", state, indices=idx)
         self.env.env_method("arm")
 
     def _disarm(self) -> None:
         if self.env is not None and self.env.has_attr("disarm"):
             self.env.env_method("disarm")
+
+    def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
+        """
+        As in SB3.
+
+        :raises ValueError: if it is not a ``DualReplayBuffer``; then nothing is changed
+        """
+        before = self.replay_buffer
+        super().load_replay_buffer(path, truncate_last_traj)
+        if not isinstance(self.replay_buffer, DualReplayBuffer):
+            other, self.replay_buffer = self.replay_buffer, before
+            raise ValueError(f"load_replay_buffer: {path} holds no DualReplayBuffer, got {type(other).__name__}.")
 
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
@@ -145,7 +167,12 @@ class GuidedOffPolicyAlgorithm(CheckedOffPolicyAlgorithm):
         for idx, info in enumerate(infos):
             takeover = bool(info.get("takeover", "intervene_action" in info))
             if takeover:
-                applied = info["applied_action"] if "applied_action" in info else info["intervene_action"]
+                applied = info.get("applied_action", info.get("intervene_action"))
+                if applied is None:
+                    raise ValueError(
+                        f"info['takeover'] of environment {idx} is set, but what was executed is missing: add it as "
+                        "info['applied_action'], in the units of the action space."
+                    )
                 executed[idx] = self.policy.scale_action(np.asarray(applied))
             start = bool(info.get("takeover_start", takeover and not self.human_driving[idx]))
             marked.append({**info, "takeover": takeover, "takeover_start": start, "novice_action": buffer_action[idx]})

@@ -55,7 +55,7 @@ class DPVP(GuidedOffPolicyAlgorithm, DSAC):
     ent_coef         0.01       "auto"
     pv_min_diff      0.15       0
     bounded_targets  True       False
-    weight_decay     1          0
+    weight_decay     3          0
     average_tau      0.0005     1
     ===============  =========  =======
 
@@ -119,7 +119,7 @@ class DPVP(GuidedOffPolicyAlgorithm, DSAC):
             "ent_coef": 0.01,
             "pv_min_diff": 0.15,
             "bounded_targets": True,
-            "weight_decay": 1.0,
+            "weight_decay": 3.0,
             "average_tau": 5e-4,
         },
         "paper": {

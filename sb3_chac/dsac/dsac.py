@@ -1,4 +1,5 @@
 from collections import defaultdict
+from collections.abc import Callable
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -313,17 +314,25 @@ class DSAC(CheckedOffPolicyAlgorithm):
         return losses, (q_values, stds), stats
 
     def _update_actor(
-        self, actor: Actor, critic: DistributionalCritic, observations: PyTorchObs, ent_coef: th.Tensor
+        self,
+        actor: Actor,
+        critic: DistributionalCritic,
+        observations: PyTorchObs,
+        ent_coef: th.Tensor,
+        penalty: Callable[[th.Tensor], th.Tensor] | None = None,
     ) -> dict[str, th.Tensor]:
         """
         Optimize an actor against the smaller mean of a critic, and the entropy coefficient.
 
+        :param penalty: of the actions, of shape (batch_size, action_dim); subtracted from the mean, shape (batch_size,)
         :return: what to log
         """
         actions, log_prob = actor.action_log_prob(observations)
         with frozen(critic.optimizer.param_groups[0]["params"]):
             q_values, _ = critic(observations, actions)
             actor_loss = (ent_coef * log_prob - q_values.min(dim=0).values).mean()
+            if penalty is not None:
+                actor_loss = actor_loss + penalty(actions).mean()
             minimize(actor_loss, actor.optimizer)
         entropy = -log_prob.detach().mean()
         if self.ent_coef_optimizer is not None:

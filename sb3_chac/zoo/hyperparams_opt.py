@@ -32,5 +32,63 @@ def sample_dsac_params(trial: optuna.Trial, n_actions: int, n_envs: int, additio
     return convert_offpolicy_params(params)
 
 
-HYPERPARAMS_SAMPLER: dict[str, Callable[..., dict[str, Any]]] = {"dsac": sample_dsac_params}
-HYPERPARAMS_CONVERTER: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {"dsac": convert_offpolicy_params}
+def sample_pvp_params(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> dict[str, Any]:
+    """
+    :return: keyword arguments of PVP. For the parameters see ``sample_dsac_params``
+    """
+    return convert_offpolicy_params(_suggest_guided(trial))
+
+
+def sample_dpvp_params(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> dict[str, Any]:
+    """
+    :return: keyword arguments of DPVP. For the parameters see ``sample_dsac_params``
+    """
+    return convert_offpolicy_params(_suggest_dpvp(trial))
+
+
+def sample_chac_params(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> dict[str, Any]:
+    """
+    ``switch_after`` is not among them: it has to fit the number of steps of a trial, so set it with ``-params``.
+
+    :return: keyword arguments of CHAC. For the parameters see ``sample_dsac_params``
+    """
+    confidence = {
+        "delta": trial.suggest_float("delta", 0.05, 0.5),
+        "sigma_scale": trial.suggest_float("sigma_scale", 0.01, 1.0, log=True),
+        "tau_c": trial.suggest_float("tau_c", 0.005, 0.05, log=True),
+    }
+    return convert_offpolicy_params(_suggest_dpvp(trial) | confidence)
+
+
+def _suggest_guided(trial: optuna.Trial) -> dict[str, Any]:
+    """
+    :return: what all algorithms that learn from takeovers have in common, before the conversion
+    """
+    params: dict[str, Any] = {
+        "one_minus_gamma": trial.suggest_float("one_minus_gamma", 0.003, 0.1, log=True),
+        "batch_size_pow": trial.suggest_int("batch_size_pow", 6, 9),  # 64 to 512
+        "learning_rate": trial.suggest_float("learning_rate", 1e-4, 0.002, log=True),
+        "tau": trial.suggest_float("tau", 0.001, 0.05, log=True),
+        "policy_delay": trial.suggest_int("policy_delay", 1, 3),
+        "net_arch": trial.suggest_categorical("net_arch", ["small", "medium", "large"]),
+        "pv_coef": trial.suggest_float("pv_coef", 0.3, 3.0, log=True),
+        "pv_min_diff": trial.suggest_float("pv_min_diff", 0.0, 0.3),
+    }
+    trial.set_user_attr("gamma", 1 - params["one_minus_gamma"])
+    trial.set_user_attr("batch_size", 2 ** params["batch_size_pow"])
+    return params
+
+
+def _suggest_dpvp(trial: optuna.Trial) -> dict[str, Any]:
+    return _suggest_guided(trial) | {"ent_coef": trial.suggest_float("ent_coef", 1e-4, 0.05, log=True)}
+
+
+HYPERPARAMS_SAMPLER: dict[str, Callable[..., dict[str, Any]]] = {
+    "dsac": sample_dsac_params,
+    "pvp": sample_pvp_params,
+    "dpvp": sample_dpvp_params,
+    "chac": sample_chac_params,
+}
+HYPERPARAMS_CONVERTER: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = dict.fromkeys(
+    HYPERPARAMS_SAMPLER, convert_offpolicy_params
+)

@@ -1,12 +1,8 @@
 """What RL-Zoo3 has to be told of our algorithms, and gymnasium of our environments."""
 
-import contextlib
-import functools
 import importlib
-import inspect
 from pathlib import Path
 from types import ModuleType
-from typing import Any
 
 import sb3_chac
 
@@ -57,23 +53,9 @@ def add_experiments(exp_manager: ModuleType) -> None:
     """
     :param exp_manager: ``rl_zoo3.exp_manager``
     """
-    from sb3_chac.envs import ENVIRONMENTS
+    from sb3_chac.zoo.experiments import extend
     from sb3_chac.zoo.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 
     exp_manager.HYPERPARAMS_SAMPLER.update(HYPERPARAMS_SAMPLER)
     exp_manager.HYPERPARAMS_CONVERTER.update(HYPERPARAMS_CONVERTER)
-
-    original = exp_manager.ExperimentManager.__init__
-    if hasattr(original, "__wrapped__"):
-        return
-    signature = inspect.signature(original)
-
-    @functools.wraps(original)
-    def with_our_hyperparams(*args: Any, **kwargs: Any) -> None:
-        arguments = signature.bind(*args, **kwargs).arguments
-        if not arguments.get("config") and (arguments["algo"] in ALGORITHMS or arguments["env_id"] in ENVIRONMENTS):
-            with contextlib.suppress(FileNotFoundError):  # then it says itself that it has none either
-                arguments["config"] = str(hyperparams_file(arguments["algo"]))
-        original(**arguments)
-
-    exp_manager.ExperimentManager.__init__ = with_our_hyperparams
+    extend(exp_manager.ExperimentManager)

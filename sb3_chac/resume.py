@@ -1,0 +1,101 @@
+"""``python -m sb3_chac resume``: go on with a training that was interrupted."""
+
+import argparse
+import json
+import shlex
+import sys
+import zipfile
+from pathlib import Path
+
+from sb3_chac.common.checkpoints import FOLDER, newest_checkpoint
+from sb3_chac.zoo import register
+
+DESCRIPTION = """Go on with a training that was interrupted or killed (kill -9, a power cut), from its newest checkpoint.
+
+  sb3-chac resume logs/chac/SafeDrive-v0_1
+
+Run it in the folder where the training was started: its command line is repeated, for the steps that remain. Model,
+optimizers, replay buffer, stage, counts and the human's budget are those of the checkpoint; the seeds are others, so that no
+episode is seen twice. What was done after the checkpoint is lost. Episodes, evaluations and checkpoints go into a run folder
+of its own (_2 after _1), which can be resumed in turn.
+
+'rl_zoo3 train' with an algorithm of sb3_chac writes a checkpoint every --save-freq steps (10000 if it is not given, none with
+--save-freq 0) and at the end, and keeps the newest in <run folder>/checkpoints. Resume run folders that you trust only."""
+
+
+class NotResumable(ValueError):
+    """Raised for a folder from which no training can go on; says what to do."""
+
+
+def main(arguments: list[str]) -> None:
+    """
+    :param arguments: of the command line, after ``resume``
+    """
+    parser = argparse.ArgumentParser(
+        "sb3-chac resume", description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("run_folder", type=Path, metavar="RUN_FOLDER", help="e.g. logs/chac/SafeDrive-v0_1")
+    run_folder = parser.parse_args(arguments).run_folder
+    try:
+        command, model = find_training(run_folder)
+        done, total = steps(model)
+    except NotResumable as error:
+        parser.exit(2, f"{parser.prog}: error: {error}\n")
+    if done >= total:
+        print(f"{run_folder}: nothing remains to be done, all {total} steps were made.")
+        return
+
+    register()
+    from rl_zoo3.train import train
+
+    sys.argv[1:] = [*command, "-i", str(model)]
+    train()
+
+
+def find_training(run_folder: Path) -> tuple[list[str], Path]:
+    """
+    :param run_folder: of RL-Zoo3, e.g. logs/chac/SafeDrive-v0_1
+    :return: arguments of ``rl_zoo3 train``, and the model of the newest checkpoint
+    :raises NotResumable: if one of them is not there, or the training was started elsewhere
+    """
+    if not run_folder.is_dir():
+        raise NotResumable(f"{run_folder}: there is no such folder.")
+    files = list(run_folder.glob("*/argv.json"))
+    if len(files) != 1:
+        raise NotResumable(
+            f"{run_folder} is not the folder of a run, such as logs/chac/SafeDrive-v0_1, of 'rl_zoo3 train' with an algorithm "
+            "of sb3_chac: it holds no <environment>/argv.json."
+        )
+    try:
+        command = [str(argument) for argument in json.loads(files[0].read_text())]
+    except (OSError, ValueError, TypeError) as error:
+        raise NotResumable(f"{files[0]} cannot be read: {error}") from error
+    checkpoint = newest_checkpoint(run_folder / FOLDER)
+    if checkpoint is None:
+        raise NotResumable(
+            f"{run_folder} holds no checkpoint yet. If it was itself resumed, resume the run before it; else start anew with\n"
+            f"  rl_zoo3 train {shlex.join(command)}"
+        )
+    parser = argparse.ArgumentParser(add_help=False)
+    parser.add_argument("-f", "--log-folder", default="logs")
+    log_folder = Path(parser.parse_known_args(command)[0].log_folder)
+    if log_folder.resolve() != run_folder.resolve().parents[1]:
+        raise NotResumable(
+            f"{run_folder} was written to the log folder {log_folder}, which from here is {log_folder.resolve()}: "
+            "change to the folder where the training was started."
+        )
+    return command, checkpoint / f"{files[0].parent.name}.zip"
+
+
+def steps(model: Path) -> tuple[int, int]:
+    """
+    :param model: of a checkpoint
+    :return: how many steps were made, and how many were to be made in all
+    :raises NotResumable: if it cannot be read
+    """
+    try:
+        with zipfile.ZipFile(model) as archive:
+            data = json.loads(archive.read("data"))
+        return int(data["num_timesteps"]), int(data["_total_timesteps"])
+    except (OSError, zipfile.BadZipFile, KeyError, ValueError, TypeError) as error:
+        raise NotResumable(f"{model} cannot be read: {error}") from error

@@ -1,0 +1,106 @@
+"""What RL-Zoo3's experiments do besides with our algorithms and environments: see the function of each method."""
+
+import contextlib
+import functools
+import inspect
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+from sb3_chac.common.checkpoints import ResumableCheckpoint, checkpoint_step
+from sb3_chac.envs import ENVIRONMENTS, VALIDATION
+from sb3_chac.zoo.registration import ALGORITHMS, hyperparams_file
+
+# Steps between two checkpoints unless --save-freq says otherwise: what a person does at most for nothing
+SAVE_FREQ = 10_000
+
+
+def extend(manager: type) -> None:
+    """
+    Calling it again changes nothing.
+
+    :param manager: ``rl_zoo3.exp_manager.ExperimentManager``
+    """
+    for name, around in AROUND.items():
+        original = getattr(manager, name)
+        if not hasattr(original, "__wrapped__"):
+            setattr(manager, name, _wrapped(original, around))
+
+
+def _wrapped(original: Callable[..., Any], around: Callable[..., Any]) -> Callable[..., Any]:
+    @functools.wraps(original)
+    def method(self: Any, *args: Any, **kwargs: Any) -> Any:
+        return around(functools.partial(original, self), self, *args, **kwargs)
+
+    return method
+
+
+def init(original: Callable[..., None], manager: Any, *args: Any, **kwargs: Any) -> None:
+    """
+    Our hyperparameters, unless others are named; and other seeds than those that a checkpoint began with: the episodes are not
+    to be the same again.
+    """
+    arguments = inspect.signature(original).bind(*args, **kwargs).arguments
+    algo = arguments["algo"]
+    if not arguments.get("config") and (algo in ALGORITHMS or arguments["env_id"] in ENVIRONMENTS):
+        with contextlib.suppress(FileNotFoundError):  # then RL-Zoo3 says itself that it has none either
+            arguments["config"] = str(hyperparams_file(algo))
+    done = checkpoint_step(arguments.get("trained_agent", "")) if algo in ALGORITHMS else None
+    if done is not None:
+        arguments["seed"] = (arguments.get("seed", 0) + done) % 2**32
+    original(**arguments)
+    manager.steps_done = done
+
+
+def preprocess_hyperparams(original: Callable[..., Any], manager: Any, hyperparams: dict[str, Any]) -> Any:
+    """Our environments are evaluated on maps that are neither those of the training nor those of the final test."""
+    processed = original(hyperparams)
+    env_id = manager.env_name.gym_id
+    if manager._eval_env_kwargs_args is None and env_id in VALIDATION:
+        manager.eval_env_kwargs = {**manager.env_kwargs, **VALIDATION[env_id]}
+    return processed
+
+
+def create_callbacks(original: Callable[..., None], manager: Any) -> None:
+    """Our algorithms write checkpoints to resume from, except in trials of Optuna and with ``--save-freq 0``."""
+    save_freq = manager.save_freq  # it is changed
+    original()
+    if manager.algo in ALGORITHMS and not manager.optimize_hyperparameters and save_freq != 0:
+        save_freq = save_freq if save_freq > 0 else SAVE_FREQ
+        manager.callbacks.append(ResumableCheckpoint(save_freq, manager.save_path, manager.env_name))
+
+
+def save_config(original: Callable[..., None], manager: Any, saved_hyperparams: dict[str, Any]) -> None:
+    """The command line in a form that can be repeated, without what ``sb3-chac resume`` adds to it."""
+    original(saved_hyperparams)
+    if manager.algo in ALGORITHMS:
+        arguments = sys.argv[1:]
+        if manager.steps_done is not None and arguments[-2:] == ["-i", manager.trained_agent]:
+            del arguments[-2:]
+        Path(manager.params_path, "argv.json").write_text(json.dumps(arguments) + "\n")
+
+
+def learn(original: Callable[..., None], manager: Any, model: Any) -> None:
+    """From a checkpoint on, only the steps that remain of the total are made, and counted on."""
+    if manager.steps_done is None:
+        return original(model)
+    remaining = max(manager.n_timesteps - model.num_timesteps, 0)
+    print(f"Resuming at step {model.num_timesteps}, {remaining} of {manager.n_timesteps} steps remain. Seed: {manager.seed}")
+
+    def go_on(total_timesteps: int, **kwargs: Any) -> Any:
+        return model.learn(remaining, reset_num_timesteps=False, **kwargs)
+
+    original(SimpleNamespace(learn=go_on, env=model.env))
+
+
+# Method of ExperimentManager -> what is called in its place, with the original
+AROUND: dict[str, Callable[..., Any]] = {
+    "__init__": init,
+    "_preprocess_hyperparams": preprocess_hyperparams,
+    "create_callbacks": create_callbacks,
+    "_save_config": save_config,
+    "learn": learn,
+}
