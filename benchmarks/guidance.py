@@ -2,6 +2,7 @@
 
     python benchmarks/guidance.py run --jobs 2     # runs what is missing; stop and restart it at any time
     python benchmarks/guidance.py report           # prints the tables and draws the curves from the CSVs
+    python benchmarks/guidance.py cost             # CPU time that wrapper, human and dual buffer add to a step of DSAC
     python benchmarks/guidance.py agents           # copies one trained agent per method to benchmarks/agents/
 
 Hyperparameters are those of ``hyperparams/<algo>.yml``. Training maps 100-119; every evaluation is one deterministic episode
@@ -30,7 +31,9 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 
+from sb3_chac import DSAC, InterventionWrapper
 from sb3_chac.common.evaluation import evaluate
+from sb3_chac.common.guided import GuidedOffPolicyAlgorithm
 from sb3_chac.zoo.registration import hyperparams_file
 
 HERE = Path(__file__).parent
@@ -198,6 +201,37 @@ def report(args: argparse.Namespace) -> None:
     (args.results / "summary.json").write_text(json.dumps(rows, indent=2) + "\n")
 
 
+class GuidedDSAC(GuidedOffPolicyAlgorithm, DSAC):
+    """DSAC that stores what a human drives apart, and else learns as it does."""
+
+
+def cost(args: argparse.Namespace) -> None:
+    """CPU time of a step of DSAC, with the wrapper, the human and the dual buffer and without, taking turns."""
+    th.set_num_threads(1)
+    params = dict(learning_rate=3e-4, learning_starts=200, policy_delay=1, policy_kwargs=dict(net_arch=[256, 256]), seed=0)
+    guided_env = make_vec_env("SafeDrive-v0", seed=0, wrapper_class=InterventionWrapper)
+    models = {
+        "plain": DSAC("MlpPolicy", make_vec_env("SafeDrive-v0", seed=0), **params),
+        "guided": GuidedDSAC("MlpPolicy", guided_env, **params),
+    }
+    rows = []
+    for part in range(11):
+        for name, model in models.items():
+            start = time.process_time()
+            model.learn(1000, reset_num_timesteps=False)
+            rows.append(
+                {"part": part, "kind": name, "cpu_ms_per_step": round(time.process_time() - start, 4), "versions": VERSIONS}
+            )
+    times = {name: [row["cpu_ms_per_step"] for row in rows if row["kind"] == name and row["part"] > 0] for name in models}
+    ratios = np.array(times["guided"]) / np.array(times["plain"])
+    print({name: f"{np.median(values):.2f} ms" for name, values in times.items()}, end=" ")
+    print(f"guided / plain: median {np.median(ratios):.3f}, {ratios.min():.3f} to {ratios.max():.3f} in ten rounds")
+    with (args.results / "cost.csv").open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+
+
 def agents(args: argparse.Namespace) -> None:
     """Of each method, the seed whose last evaluation is the median of the returns."""
     folder = HERE / "agents"
@@ -213,7 +247,7 @@ def agents(args: argparse.Namespace) -> None:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("command", choices=["run", "report", "agents"])
+    parser.add_argument("command", choices=["run", "report", "agents", "cost"])
     parser.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS))
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
     parser.add_argument("--every", type=int, default=10_000, help="steps between evaluations")
@@ -221,4 +255,4 @@ if __name__ == "__main__":
     parser.add_argument("--results", type=Path, default=RESULTS)
     parser.add_argument("--models", type=Path, default=HERE / "models", help="not committed")
     arguments = parser.parse_args()
-    {"run": run_all, "report": report, "agents": agents}[arguments.command](arguments)
+    {"run": run_all, "report": report, "agents": agents, "cost": cost}[arguments.command](arguments)

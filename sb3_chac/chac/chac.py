@@ -13,6 +13,7 @@ from sb3_chac.chac.policies import CONTROLS, CHACPolicy, CnnPolicy, MlpPolicy, M
 from sb3_chac.common.buffers import DualReplayBuffer, DualReplayBufferSamples
 from sb3_chac.common.checks import check_integer, check_range
 from sb3_chac.common.critics import DistributionalCritic
+from sb3_chac.common.distributional import return_targets
 from sb3_chac.common.utils import TargetUpdate, minimize
 from sb3_chac.dpvp.dpvp import DPVP
 
@@ -52,7 +53,7 @@ class CHAC(DPVP):
     ==================  ==========  =======
     argument            "default"   "paper"
     ==================  ==========  =======
-    sigma_scale         0.08        1
+    sigma_scale         0.02        1
     tau_c               0.02        ``tau``
     prefit_steps        5000        0
     bootstrap           "executed"  "self"
@@ -133,7 +134,7 @@ class CHAC(DPVP):
     presets: ClassVar[dict[str, dict[str, Any]]] = {
         "default": DPVP.presets["default"]
         | {
-            "sigma_scale": 0.08,
+            "sigma_scale": 0.02,
             "tau_c": 0.02,
             "prefit_steps": 5000,
             "bootstrap": "executed",
@@ -277,6 +278,7 @@ class CHAC(DPVP):
         self.policy.control = "shared" if self.shared_control else "self"
         self.confidence_update = TargetUpdate(self.confidence_critic, self.confidence_critic_target)
         self.self_update = TargetUpdate(self.self_actor, self.self_actor_target)
+        self.self_average_update = TargetUpdate(self.self_actor, self.policy.averaged_self_actor)
         self.choices: defaultdict[str, list[np.ndarray]] = defaultdict(list)
 
     def _create_aliases(self) -> None:
@@ -350,27 +352,37 @@ class CHAC(DPVP):
                 lambda actions: self.anchor_coef * (actions - guided_actions).square().sum(dim=1),
             )
             self.self_update(self.tau)
+            self.self_average_update(self.average_tau)
         return stats
 
     def _update_confidence_critic(self, batch: DualReplayBufferSamples) -> dict[str, th.Tensor]:
         """Z_c evaluates, with reward, what is executed."""
         ent_coef = self.log_ent_coef.detach().exp()
-        with th.no_grad():
-            next_obs, target = batch.next_observations, self.confidence_critic_target
-            if self.stage == 1:
-                next_actions, next_log_prob = self.actor_target.action_log_prob(next_obs)
-            else:
-                next_actions, next_log_prob = self.self_actor_target.action_log_prob(next_obs)
-                if self.bootstrap == "executed" and self.shared_control:
-                    choice = self.policy.choose(next_obs, next_actions, target)
-                    # The mode of pi_g has no entropy
-                    next_actions, next_log_prob = choice.actions, next_log_prob * choice.self_drives
-            rewards, discounts = batch.rewards.flatten(), self._discounts(batch)
-            targets = target.backup(rewards, discounts, next_obs, next_actions, ent_coef * next_log_prob)
+        rewards, target = batch.rewards.flatten(), self.confidence_critic_target
+        if self.stage == 1:
+            targets = self._return_targets(self.actor_target, target, batch, rewards, ent_coef)
+        elif self.bootstrap == "self" or not self.shared_control:
+            targets = self._return_targets(self.self_actor_target, target, batch, rewards, ent_coef)
+        else:
+            targets = self._shared_return_targets(batch, rewards, ent_coef)
         losses, _, stats = self._critic_losses(self.confidence_critic, batch, targets, self.eta_c)
         minimize(losses.mean(dim=1).sum(), self.confidence_critic.optimizer)
         self.confidence_update(self.tau if self.tau_c is None else self.tau_c)
         return {f"confidence_{name}": value for name, value in stats.items()}
+
+    @th.no_grad()
+    def _shared_return_targets(
+        self, batch: DualReplayBufferSamples, rewards: th.Tensor, ent_coef: th.Tensor
+    ) -> tuple[th.Tensor, th.Tensor]:
+        """
+        :return: y_q and y_z with a' from shared control, both of shape (batch_size,)
+        """
+        self_actions, log_prob = self.self_actor_target.action_log_prob(batch.next_observations)
+        choice = self.policy.choose(batch.next_observations, self_actions, self.confidence_critic_target)
+        next_q = th.where(choice.self_drives, choice.q_self, choice.q_guided)
+        next_std = th.where(choice.self_drives, choice.std_self, choice.std_guided)
+        # The mode of pi_g has no entropy
+        return return_targets(rewards, self._discounts(batch), next_q, next_std, ent_coef * log_prob * choice.self_drives)
 
     def _on_step(self) -> None:
         super()._on_step()
@@ -466,7 +478,14 @@ class CHAC(DPVP):
 
     def _excluded_save_params(self) -> list[str]:
         networks = ["confidence_critic", "confidence_critic_target", "self_actor", "self_actor_target"]
-        return [*super()._excluded_save_params(), *networks, "confidence_update", "self_update", "choices"]
+        return [
+            *super()._excluded_save_params(),
+            *networks,
+            "confidence_update",
+            "self_update",
+            "self_average_update",
+            "choices",
+        ]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         state_dicts, tensors = super()._get_torch_save_params()

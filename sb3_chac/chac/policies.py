@@ -27,8 +27,8 @@ class Choice(NamedTuple):
 class CHACPolicy(DPVPPolicy):
     """
     The two policies of C-HAC and what decides between them. To ``DPVPPolicy`` (pi_g is its ``actor``, Z_g its ``critic``) it
-    adds the confidence return distribution Z_c (``confidence_critic``), the self-learning policy pi_r (``self_actor``) and
-    target copies of both.
+    adds the confidence return distribution Z_c (``confidence_critic``), the self-learning policy pi_r (``self_actor``),
+    target copies of both, and the average of pi_r's parameters that acts when ``deterministic``.
 
     In stage 1, and as ``control="guided"``, pi_g acts; as ``control="self"``, pi_r; as ``control="shared"``, pi_r where::
 
@@ -45,6 +45,7 @@ class CHACPolicy(DPVPPolicy):
     confidence_critic_target: DistributionalCritic
     self_actor: Actor
     self_actor_target: Actor
+    averaged_self_actor: Actor
     stage: th.Tensor
 
     def __init__(self, *args: Any, delta: float = 0.15, sigma_scale: float = 1.0, control: str = "shared", **kwargs: Any):
@@ -59,21 +60,20 @@ class CHACPolicy(DPVPPolicy):
     def _build(self, lr_schedule: Schedule) -> None:
         super()._build(lr_schedule)
         self.confidence_critic, self.confidence_critic_target = (self.make_critic() for _ in range(2))
-        self.self_actor, self.self_actor_target = (self.make_actor() for _ in range(2))
+        self.self_actor, self.self_actor_target, self.averaged_self_actor = (self.make_actor() for _ in range(3))
         self.confidence_critic_target.load_state_dict(self.confidence_critic.state_dict())
-        self.self_actor_target.load_state_dict(self.self_actor.state_dict())
         for network in (self.confidence_critic, self.self_actor):
             network.optimizer = self.optimizer_class(
                 network.parameters(),
                 lr=lr_schedule(1),  # type: ignore[call-arg]
                 **self.optimizer_kwargs,
             )
-        for target in (self.confidence_critic_target, self.self_actor_target):
-            target.set_training_mode(False)
+        for copy in (self.confidence_critic_target, self.self_actor_target, self.averaged_self_actor):
+            copy.set_training_mode(False)
 
     def start_stage_2(self) -> None:
         """pi_g is its average from now on. pi_r goes on from there, with a fresh optimizer."""
-        for actor in (self.actor, self.actor_target, self.self_actor, self.self_actor_target):
+        for actor in (self.actor, self.self_actor, self.self_actor_target, self.averaged_self_actor):
             actor.load_state_dict(self.averaged_actor.state_dict())
         self.self_actor.optimizer.state.clear()
         self.stage.fill_(2)
@@ -97,7 +97,7 @@ class CHACPolicy(DPVPPolicy):
         control = "guided" if self.stage == 1 else self.control
         if control == "guided":
             return super()._predict(observation, deterministic)
-        self_actions = self.self_actor(observation, deterministic)
+        self_actions = self.averaged_self_actor(observation, True) if deterministic else self.self_actor(observation)
         if control == "self":
             return self_actions
         self.last_choice = self.choose(observation, self_actions, self.confidence_critic)

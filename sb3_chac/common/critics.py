@@ -11,7 +11,6 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 
-from sb3_chac.common.distributional import clipped_normal_like
 from sb3_chac.common.linear import StackedLinear, use_fast_linear
 
 # Keeps sigma positive where softplus underflows
@@ -88,24 +87,6 @@ class DistributionalCritic(BaseModel):
         q_values, stds = self(obs, actions)
         smaller = q_values.argmin(dim=0, keepdim=True)
         return q_values.gather(0, smaller).squeeze(0), stds.gather(0, smaller).squeeze(0)
-
-    def backup(
-        self, rewards: th.Tensor, discounts: th.Tensor, next_obs: PyTorchObs, next_actions: th.Tensor, entropy_term: th.Tensor
-    ) -> tuple[th.Tensor, th.Tensor]:
-        """
-        Targets of DSAC-T from this (target) critic: ``y_q = r + gamma (1 - d) (Q_m - alpha log pi)``, and y_z with a sample
-        of Z_m in place of its mean Q_m; m is the critic with the smaller mean.
-
-        :param rewards: r, shape (batch_size,)
-        :param discounts: gamma (1 - d), shape (batch_size,)
-        :param next_obs: batch of next observations
-        :param next_actions: a', scaled to [-1, 1], shape (batch_size, action_dim)
-        :param entropy_term: alpha log pi(a'|s'), shape (batch_size,)
-        :return: y_q and y_z, both of shape (batch_size,)
-        """
-        next_q, next_std = self.pessimistic(next_obs, next_actions)
-        mean_targets = rewards + discounts * (next_q - entropy_term)
-        return mean_targets, mean_targets + discounts * clipped_normal_like(next_q) * next_std
 
     @th.no_grad()
     def update_mean_std(self, stds: th.Tensor, tau: float) -> th.Tensor:

@@ -46,6 +46,24 @@ def gaussian_surrogate_loss(
     return q_gradient * q_values + std_gradient * stds
 
 
+def return_targets(
+    rewards: th.Tensor, discounts: th.Tensor, next_q_values: th.Tensor, next_stds: th.Tensor, entropy_term: th.Tensor
+) -> tuple[th.Tensor, th.Tensor]:
+    """
+    Targets of DSAC-T: ``y_q = r + gamma (1 - d) (Q_m(s', a') - alpha log pi(a'|s'))``, and y_z with a sample of Z_m(s', a') in
+    place of its mean; m is the target critic with the smaller mean.
+
+    :param rewards: r, shape (batch_size,), as all others
+    :param discounts: gamma (1 - d)
+    :param next_q_values: Q_m(s', a')
+    :param next_stds: sigma_m(s', a')
+    :param entropy_term: alpha log pi(a'|s')
+    :return: y_q and y_z, both of shape (batch_size,)
+    """
+    mean_targets = rewards + discounts * (next_q_values - entropy_term)
+    return mean_targets, mean_targets + discounts * clipped_normal_like(next_q_values) * next_stds
+
+
 def gaussian_nll(q_values: th.Tensor, stds: th.Tensor, sampled_targets: th.Tensor) -> th.Tensor:
     """
     Negative log-likelihood of sampled returns, the figure to watch in place of the surrogate's value.

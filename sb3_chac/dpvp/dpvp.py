@@ -276,7 +276,8 @@ class DPVP(GuidedOffPolicyAlgorithm, DSAC):
 
     def _update_proxy_critic(self, batch: DualReplayBufferSamples, ent_coef: th.Tensor) -> dict[str, th.Tensor]:
         # Temporal differences without reward
-        targets = self._return_targets(self.critic_target, batch, th.zeros_like(batch.rewards.flatten()), ent_coef)
+        no_rewards = th.zeros_like(batch.rewards.flatten())
+        targets = self._return_targets(self.actor_target, self.critic_target, batch, no_rewards, ent_coef)
         if self.bounded_targets:
             mean_targets, sampled_targets = (target.clamp(-self.proxy_value, self.proxy_value) for target in targets)
             targets = mean_targets, sampled_targets

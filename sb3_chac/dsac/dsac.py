@@ -13,7 +13,7 @@ from stable_baselines3.sac.policies import Actor
 
 from sb3_chac.common.checks import check_integer, check_learning_rate, check_range
 from sb3_chac.common.critics import DistributionalCritic
-from sb3_chac.common.distributional import gaussian_nll, gaussian_surrogate_loss
+from sb3_chac.common.distributional import gaussian_nll, gaussian_surrogate_loss, return_targets
 from sb3_chac.common.off_policy_algorithm import CheckedOffPolicyAlgorithm
 from sb3_chac.common.utils import TargetUpdate, frozen, minimize
 from sb3_chac.dsac.policies import CnnPolicy, DSACPolicy, MlpPolicy, MultiInputPolicy
@@ -271,7 +271,7 @@ class DSAC(CheckedOffPolicyAlgorithm):
         """
         ent_coef = self.log_ent_coef.detach().exp()
         # Optimize the critics
-        targets = self._return_targets(self.critic_target, batch, batch.rewards.flatten(), ent_coef)
+        targets = self._return_targets(self.actor_target, self.critic_target, batch, batch.rewards.flatten(), ent_coef)
         losses, _, stats = self._critic_losses(self.critic, batch, targets)
         minimize(losses.mean(dim=1).sum(), self.critic.optimizer)
 
@@ -284,15 +284,14 @@ class DSAC(CheckedOffPolicyAlgorithm):
 
     @th.no_grad()
     def _return_targets(
-        self, critic_target: DistributionalCritic, batch: Any, rewards: th.Tensor, ent_coef: th.Tensor
+        self, actor_target: Actor, critic_target: DistributionalCritic, batch: Any, rewards: th.Tensor, ent_coef: th.Tensor
     ) -> tuple[th.Tensor, th.Tensor]:
         """
-        :return: y_q and y_z with a' from the target actor, both of shape (batch_size,)
+        :return: y_q and y_z with a' from ``actor_target``, both of shape (batch_size,)
         """
-        next_actions, next_log_prob = self.actor_target.action_log_prob(batch.next_observations)
-        return critic_target.backup(
-            rewards, self._discounts(batch), batch.next_observations, next_actions, ent_coef * next_log_prob
-        )
+        next_actions, next_log_prob = actor_target.action_log_prob(batch.next_observations)
+        next_q, next_std = critic_target.pessimistic(batch.next_observations, next_actions)
+        return return_targets(rewards, self._discounts(batch), next_q, next_std, ent_coef * next_log_prob)
 
     def _discounts(self, batch: Any) -> th.Tensor:
         # For n-step replay, discount factor is gamma**n_steps (when no early termination)
