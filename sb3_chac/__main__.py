@@ -5,13 +5,14 @@ RL-Zoo3's are for places where the stock ``rl_zoo3`` command does not find them 
 
 import sys
 
-COMMANDS = ("train", "enjoy", "plot_train", "plot_from_file", "all_plots", "evaluate", "resume")
+COMMANDS = ("train", "enjoy", "plot_train", "plot_from_file", "all_plots", "evaluate", "resume", "plot")
 
 USAGE = f"""usage: sb3-chac {{{",".join(COMMANDS)}}} ...
 
 RL-Zoo3's commands with the algorithms of sb3_chac, and
   evaluate MODEL.zip    a model or an expert on held-out scenarios
   resume RUN_FOLDER     go on with a training that was interrupted or killed, from its newest checkpoint
+  plot RUN_FOLDER       its curves: return, success rate, safety cost, what the human drove
 'sb3-chac train --help' lists the arguments, so does --help of the others."""
 
 
@@ -31,6 +32,11 @@ def main() -> None:
         from sb3_chac.resume import main as resume
 
         resume(sys.argv[2:])
+        return
+    if command == "plot":
+        from sb3_chac.plot import main as plot
+
+        plot(sys.argv[2:])
         return
 
     from rl_zoo3.cli import main as zoo_main

@@ -17,15 +17,18 @@ from rl_zoo3 import utils
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_chac.chac import CHAC
+from sb3_chac.chac.policies import CONTROLS
 from sb3_chac.common import pictures
 from sb3_chac.common.episodes import NotEvaluable, Runner, SavedModel, Task, make_env
-from sb3_chac.common.evaluation import evaluate, scenario_list
+from sb3_chac.common.evaluation import Evaluation, compare, evaluate, scenario_list
 from sb3_chac.zoo.registration import add_algorithms
 
 DESCRIPTION = """Run one deterministic episode per scenario and print return, safety cost, success rate, route completion
 and steps, as mean ± standard deviation over the episodes. The results do not depend on --jobs.
 
   sb3-chac evaluate logs/chac/SafeDrive-v0_1/best_model.zip --env SafeDrive-v0 --scenarios 1000:1050 --json chac.json
+  sb3-chac evaluate logs/chac/SafeDrive-v0_1/SafeDrive-v0.zip --beside guided self scripted
   sb3-chac evaluate --expert scripted --scenarios 1000:1012 --plot paths.png --video drive.mp4
   sb3-chac evaluate logs/sac/Pendulum-v1_1/Pendulum-v1.zip --env Pendulum-v1 --episodes 20
 
@@ -42,6 +45,14 @@ def make_parser() -> argparse.ArgumentParser:
     who.add_argument("model", nargs="?", type=Path, metavar="MODEL.zip", help="a model saved by Stable-Baselines3")
     who.add_argument("--expert", metavar="NAME", help="an expert of the environment, e.g. scripted or scripted-ideal")
     who.add_argument("--algo", metavar="NAME", help="algorithm of the model as RL-Zoo3 calls it (default: read from the file)")
+    who.add_argument("--policy", choices=CONTROLS, help="who acts of a C-HAC model in stage 2 (default: as in its training)")
+    who.add_argument(
+        "--beside",
+        nargs="+",
+        default=[],
+        metavar="NAME",
+        help="compare with these on the same episodes: experts, and guided, self or shared of the same C-HAC model",
+    )
     where = parser.add_argument_group("where")
     where.add_argument(
         "--env", default="SafeDrive-v0", metavar="ID", help="environment, also module:ID (default: %(default)s)"
@@ -76,6 +87,8 @@ def main(arguments: list[str]) -> None:
     args = parser.parse_args(arguments)
     if (args.model is None) == (args.expert is None):
         parser.exit(2, f"{parser.prog}: error: give either a MODEL.zip or --expert NAME\n")
+    if args.model is None and args.policy is not None:
+        parser.exit(2, f"{parser.prog}: error: --policy {args.policy} needs a C-HAC model\n")
 
     th.set_num_threads(1)
     try:
@@ -104,10 +117,12 @@ def run(args: argparse.Namespace) -> None:
 
     env_kwargs = parse_env_kwargs(args.env_kwargs)
     policy, normalize, who = args.expert, None, {"expert": args.expert}
+    others: dict[str, BaseAlgorithm | str] = {name: name for name in args.beside}
     if args.model is not None:
         path, algo, algorithm = find_algorithm(args.model, args.algo)
         env = make_env(args.env, env_kwargs)
-        policy = load_model(path, algo, algorithm, env)
+        policy = load_model(path, algo, algorithm, env, args.policy)
+        others |= {name: load_model(path, algo, algorithm, env, name) for name in args.beside if name in CONTROLS}
         env.close()
         statistics, normalize = find_normalization(path, args.env)
         print(f"{path}: {algorithm.__name__}" + (f", observations normalized with {statistics}" if normalize else ""))
@@ -120,21 +135,29 @@ def run(args: argparse.Namespace) -> None:
                 pictures.check_can_plot(runner, numbers[0])
             if args.video:
                 pictures.check_can_render(runner)
+    for other in others.values():
+        Runner(task._replace(policy=other)).env.close()  # finds what does not fit
 
-    evaluation = evaluate(
-        policy,
-        args.env,
-        args.scenarios,
-        episodes=args.episodes,
-        seed=args.seed,
-        jobs=args.jobs,
-        env_kwargs=env_kwargs,
-        normalize=normalize,
-        record_paths=args.plot is not None,
-        progress_bar=True,
-    )
+    def assess(acting: BaseAlgorithm | str, record_paths: bool = False) -> Evaluation:
+        return evaluate(
+            acting,
+            args.env,
+            args.scenarios,
+            episodes=args.episodes,
+            seed=args.seed,
+            jobs=args.jobs,
+            env_kwargs=env_kwargs,
+            normalize=None if isinstance(acting, str) else normalize,
+            record_paths=record_paths,
+            progress_bar=True,
+        )
+
+    evaluation = assess(policy, record_paths=args.plot is not None)
     evaluation.settings |= who
-    print(evaluation.table())
+    beside = {name: assess(other) for name, other in others.items()}
+    if beside:
+        evaluation.settings["beside"] = {name: other.to_dict() for name, other in beside.items()}
+    print(compare([evaluation, *beside.values()]) if beside else evaluation.table())
     if args.json:
         args.json.write_text(evaluation.to_json() + "\n")
     if args.plot:
@@ -246,20 +269,28 @@ def guess_algorithm(path: Path, module: str, stored: set[str], algorithms: dict[
     raise NotEvaluable(f"{path} may be any of {', '.join(sorted(candidates))}: name its algorithm with --algo.")
 
 
-def load_model(path: Path, algo: str, algorithm: type[BaseAlgorithm], env: gym.Env) -> BaseAlgorithm:
+def load_model(
+    path: Path, algo: str, algorithm: type[BaseAlgorithm], env: gym.Env, control: str | None = None
+) -> BaseAlgorithm:
     """
     :param algo: name of the algorithm, for the message
     :param algorithm: its class
     :param env: the environment that the model is to act in
+    :param control: who acts of a C-HAC model: "guided", "self" or "shared"; as in its training if None
     :return: the model, on the CPU, fit for acting only
-    :raises NotEvaluable: if it does not load, or does not fit the environment
+    :raises NotEvaluable: if it does not load, does not fit the environment, or has no such policy (yet)
     """
+    if control is not None and not issubclass(algorithm, CHAC):
+        raise NotEvaluable(f"{control!r} is a policy of C-HAC models, {path} is a model of {algo}.")
     try:
-        return SavedModel(algorithm, path.read_bytes()).load(env)
+        model = SavedModel(algorithm, path.read_bytes(), control).load(env)
     except Exception as error:  # whatever a model of another algorithm, version or environment leads to
         raise NotEvaluable(
             f"{path} cannot be loaded as {algo} for {env.unwrapped}: {error or type(error).__name__}"
         ) from error
+    if control in ("self", "shared") and isinstance(model, CHAC) and model.stage == 1:
+        raise NotEvaluable(f"{path} is in stage 1, where the guided policy acts alone: there is no {control!r} yet.")
+    return model
 
 
 def find_normalization(model: Path, env: str) -> tuple[Path, VecNormalize | None]:

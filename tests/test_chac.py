@@ -20,12 +20,22 @@ def make_chac(env=None, **kwargs):
     return make_guided(CHAC, env, **kwargs)
 
 
+def own_actors(model):
+    """pi_r, its target and its average."""
+    return model.self_actor, model.self_actor_target, model.policy.averaged_self_actor
+
+
+@th.no_grad()
+def shift_pi_r(model, shift):
+    for actor in own_actors(model):
+        actor.mu.bias += shift
+
+
 def in_stage_2(env=None, shift=0.5, **kwargs):
     """A model in stage 2 whose pi_r is ``shift`` to the right of pi_g."""
     model = silent(make_chac(env, **kwargs))
     model._start_stage_2() if len(model.replay_buffer.novice) else model.policy.start_stage_2()
-    with th.no_grad():
-        model.self_actor.mu.bias += shift
+    shift_pi_r(model, shift)
     return model
 
 
@@ -94,7 +104,8 @@ def test_pi_r_acts_where_one_can_be_confident(gain, std, sigma_scale, self_drive
     obs = th.as_tensor(OBS)
     guided = policy.actor(obs, deterministic=True).detach()
     ours = guided + 0.25
-    choice = policy.choose(obs, ours, HandSet(lambda actions: gain * (actions - guided)[:, 0] / 0.25, lambda actions: std))
+    with th.no_grad():
+        choice = policy.choose(obs, ours, HandSet(lambda actions: gain * (actions - guided)[:, 0] / 0.25, lambda actions: std))
     assert choice.self_drives.tolist() == [self_drives] * len(OBS)
     assert th.equal(choice.actions, ours if self_drives else guided)
     assert choice.confidence.numpy() == pytest.approx(norm.cdf(gain / (sigma_scale * std * 2**0.5)), abs=1e-4)
@@ -107,7 +118,9 @@ def test_each_state_has_its_own_choice():
     obs = th.as_tensor(OBS)
     guided = policy.actor(obs, deterministic=True)
     better = th.arange(len(OBS)) % 3 == 0
-    choice = policy.choose(obs, guided + 0.1, HandSet(lambda a: th.where(better, 1.0, -1.0) * (a - guided)[:, 0], lambda a: 1.0))
+    choice = policy.choose(
+        obs, guided + 0.1, HandSet(lambda a: th.where(better, 1.0, -1.0) * (a - guided)[:, 0], lambda a: 1.0)
+    )
     assert th.equal(choice.self_drives, better)
     assert th.equal(choice.actions, guided + 0.1 * better.unsqueeze(1))
 
@@ -131,7 +144,9 @@ def tilted(sign):
     return lambda actions: sign * 1e-3 * actions[:, 0]
 
 
-@pytest.mark.parametrize("delta, sign, expected", [(0.0, 1, "guided"), (1.0, -1, "self"), (0.5, 1, "self"), (0.5, -1, "guided")])
+@pytest.mark.parametrize(
+    "delta, sign, expected", [(0.0, 1, "guided"), (1.0, -1, "self"), (0.5, 1, "self"), (0.5, -1, "guided")]
+)
 def test_extremes_of_delta(delta, sign, expected):
     """0: pi_g alone; 1: pi_r alone; 0.5: who has the greater mean ("No Confidence"), whatever sigma says."""
     model = in_stage_2(delta=delta)
@@ -167,8 +182,7 @@ def test_shared_control_is_the_default_of_predict():
 def test_samples_of_pi_r_compete_with_the_mode_of_pi_g():
     model = in_stage_2(delta=0.5)
     set_critic(model, tilted(-1))  # pi_r, shifted to the right, loses nearly always
-    with th.no_grad():
-        model.self_actor.mu.bias += 5
+    shift_pi_r(model, 5)
     assert np.array_equal(predict(model, "shared", deterministic=False), predict(model, "guided"))
     set_critic(model, tilted(1))
     set_random_seed(0)
@@ -181,8 +195,7 @@ def test_samples_of_pi_r_compete_with_the_mode_of_pi_g():
 def test_in_stage_1_pi_g_acts():
     model = make_chac()
     expected = predict(model, "guided")
-    with th.no_grad():
-        model.self_actor.mu.bias += 1
+    shift_pi_r(model, 1)
     for who in (None, "shared", "self"):
         assert np.array_equal(predict(model, who), expected)
     set_random_seed(0)
@@ -249,7 +262,9 @@ def test_mean_log_prob_is_that_of_pi_g():
     assert np.mean([model._mean_log_prob() for _ in range(300)]) == pytest.approx(-expected, abs=0.15)
 
 
-@pytest.mark.parametrize("kwargs, stage", [({"switch_after": 39}, 2), ({"switch_after": 40}, 1), ({"sigma_threshold": 1e-6}, 1)])
+@pytest.mark.parametrize(
+    "kwargs, stage", [({"switch_after": 39}, 2), ({"switch_after": 40}, 1), ({"sigma_threshold": 1e-6}, 1)]
+)
 def test_the_switch_happens_in_the_run(kwargs, stage):
     model = make_chac(**({"switch_after": 0} | kwargs)).learn(40)
     assert model.stage == stage
@@ -272,9 +287,11 @@ def test_pi_r_starts_where_pi_g_is(average_tau):
     model._start_stage_2()
     assert model.stage == 2
     average = dict(model.policy.averaged_actor.state_dict())
-    actors = (model.actor, model.actor_target, model.self_actor, model.self_actor_target)
+    actors = (model.actor, *own_actors(model))
     assert all(same(dict(actor.state_dict()), average) for actor in actors)
-    assert len({param.data_ptr() for actor in actors for param in actor.parameters()}) == 4 * len(list(model.actor.parameters()))
+    assert len({param.data_ptr() for actor in actors for param in actor.parameters()}) == 4 * len(
+        list(model.actor.parameters())
+    )
     assert len(model.self_actor.optimizer.state) == 0
     for part in ("averaged_actor.", "critic.", "critic_target."):
         assert same(parameters(model, part), {name: value for name, value in before.items() if name.startswith(part)})
@@ -298,8 +315,11 @@ def test_z_c_is_fitted_at_the_switch(prefit_steps):
 
 
 def test_what_learns_in_each_stage():
-    guided = ["actor.", "actor_target.", "critic.", "critic_target."]
-    confidence, own = ["confidence_critic.", "confidence_critic_target."], ["self_actor.", "self_actor_target."]
+    guided = ["actor.", "actor_target.", "averaged_actor.", "critic.", "critic_target."]
+    confidence, own = (
+        ["confidence_critic.", "confidence_critic_target."],
+        ["self_actor.", "self_actor_target.", "averaged_self_actor."],
+    )
     model = make_chac(ent_coef="auto_0.01")
     stages = [parameters(model)]
     for _ in range(3):
@@ -352,11 +372,11 @@ def test_batches_of_each_stage(share, n_human):
 def test_the_executed_action_is_stored(shared_control, sign, who):
     """A sample of pi_r, or the mode of pi_g."""
     model = make_chac(scripted("1" * 99), switch_after=30, delta=0.5, shared_control=shared_control).learn(40)
-    with th.no_grad():
-        model.self_actor.mu.bias += 3
-        model.self_actor.log_std.bias.fill_(-1)
-    for weight in (model.self_actor.log_std.weight, model.self_actor.mu.weight):
-        weight.data.zero_()
+    shift_pi_r(model, 3)
+    for actor in own_actors(model):
+        actor.log_std.bias.data.fill_(-1)
+        for weight in (actor.log_std.weight, actor.mu.weight):
+            weight.data.zero_()
     set_critic(model, tilted(sign))
     model.replay_buffer.reset()
     model.gradient_steps = 0
@@ -418,7 +438,7 @@ def test_z_c_bootstraps_on(stage, bootstrap, shared_control, expected):
 @pytest.mark.parametrize("anchor_coef", [0.0, 1.0, 1000.0])
 def test_pi_r_climbs_the_mean_of_z_c_as_far_as_it_is_let(anchor_coef):
     """The maximum of -(a - 0.7)^2 - anchor_coef (a - a_g)^2 is between 0.7 and a_g."""
-    model = in_stage_2(learning_rate=1e-2, ent_coef=0.0, anchor_coef=anchor_coef, policy_delay=1)
+    model = in_stage_2(learning_rate=1e-2, ent_coef=0.0, anchor_coef=anchor_coef, policy_delay=1, average_tau=1.0)
     model.confidence_critic.forward = lambda obs, actions: (-((actions - 0.7) ** 2).sum(dim=1).expand(2, -1), None)
     model._update_confidence_critic = lambda batch: {}
     batch = make_batch(OBS, np.zeros((len(OBS), 2)), np.zeros(len(OBS)))
@@ -438,8 +458,7 @@ def test_the_stage_survives(stage, shared_control, tmp_path):
     model = make_chac(switch_after=30 if stage == 2 else 1000, shared_control=shared_control, delta=0.4, sigma_scale=0.3)
     model.learn(60)
     assert model.stage == stage
-    with th.no_grad():
-        model.self_actor.mu.bias += 0.5
+    shift_pi_r(model, 0.5)
     model.save(tmp_path / "model")
     model.policy.save(tmp_path / "policy")
     loaded, policy = CHAC.load(tmp_path / "model"), type(model.policy).load(tmp_path / "policy")
@@ -454,7 +473,7 @@ def test_the_stage_survives(stage, shared_control, tmp_path):
         assert np.array_equal(predict(loaded, who), predict(model, who))
     loaded.set_env(scripted("1" * 99))
     loaded.learn(10, reset_num_timesteps=False)
-    assert wrapper(loaded).human_steps == (model.counts["human_steps"] + 10 if stage == 1 else 0)
+    assert loaded.counts["human_steps"] == model.counts["human_steps"] + (10 if stage == 1 else 0)
 
 
 def test_delta_can_be_changed_on_loading(tmp_path):
@@ -464,6 +483,7 @@ def test_delta_can_be_changed_on_loading(tmp_path):
 
 
 # --- Presets
+
 
 def documented(algorithm, preset):
     """The table in the class docstring, of C-HAC with that of D-PVP."""

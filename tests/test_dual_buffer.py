@@ -126,8 +126,8 @@ def test_each_store_overwrites_its_own_oldest_row():
     assert sorted(times(buffer.novice)) == [2, 3, 4]
     assert times(buffer.human) == [1000, 1001]
     assert buffer.size() == 5
-    drawn = [buffer.sample(3, human_share=0.0).observations[:, 0].tolist() for _ in range(30)]
-    assert set(sum(drawn, [])) == {2, 3, 4}
+    drawn = [buffer.sample(3, human_share=0.0).observations[:, 0] for _ in range(30)]
+    assert set(th.cat(drawn).tolist()) == {2, 3, 4}
 
 
 @pytest.mark.parametrize("human_share, n_human", [(0, 0), (0.25, 2), (0.5, 4), (1, 8)])
@@ -262,7 +262,7 @@ def test_actions_of_any_shape_are_stored_flat(n_steps):
     assert buffer.sample(1, human_share=1.0).actions.tolist() == [action[1].flatten().tolist()]
 
 
-# In what follows step t has the reward t + 1, and gamma is 0.5. A row is (t, return, t of its next observation, discount, done)
+# Below step t has the reward t + 1, and gamma is 0.5. A row is (t, return, t of its next observation, discount, done)
 def episode(buffer, takeovers, done_at=(), timeout_at=()):
     for t, driver in enumerate(takeovers):
         done = t in (*done_at, *timeout_at)
@@ -322,7 +322,13 @@ def test_returns_end_with_the_episode(kind, done, driver):
 def test_returns_of_several_environments_do_not_mix():
     buffer = make_buffer(n_envs=3, n_steps=2)
     for t in range(3):
-        add(buffer, t, takeover=[False, t == 1, False], done=[False, False, t == 0], reward=[t + 1, 10 * (t + 1), 100 * (t + 1)])
+        add(
+            buffer,
+            t,
+            takeover=[False, t == 1, False],
+            done=[False, False, t == 0],
+            reward=[t + 1, 10 * (t + 1), 100 * (t + 1)],
+        )
     assert returns(buffer.novice, env=0) == [(0, 1 + 2 / 2, 2, 0.25, 0), (1, 2 + 3 / 2, 3, 0.25, 0)]
     assert returns(buffer.novice, env=1) == [(0, 10, 1, 0.5, 0)]
     assert returns(buffer.human, env=1) == [(1, 20, 2, 0.5, 0)]

@@ -2,11 +2,9 @@
 
 import warnings
 
-import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from gymnasium import spaces
 from guided_toys import (
     ALGORITHMS,
     Limited,
@@ -21,6 +19,7 @@ from guided_toys import (
     tracking_expert,
     wrapper,
 )
+from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.evaluation import evaluate_policy
@@ -117,14 +116,18 @@ class SelfDriven(Limited):
 @each_algorithm
 def test_environments_that_do_the_takeovers_themselves(algorithm):
     model = make_guided(algorithm, DummyVecEnv([lambda: SelfDriven(low=-2, high=2, limit=7)]))
-    with pytest.warns(UserWarning, match=f"{algorithm.__name__}: no human is in the loop.*InterventionWrapper.*intervene_action"):
+    with pytest.warns(
+        UserWarning, match=f"{algorithm.__name__}: no human is in the loop.*InterventionWrapper.*intervene_action"
+    ):
         model.learn(12)
     novice, human = stores(model)
     assert column(human, "reward").tolist() == [3, 4, 7, 3, 4]
     assert column(human, "takeover_start").tolist() == [1, 0, 1, 1, 0]
     assert np.allclose(column(human, "action"), EXPERT / 2)
     assert not np.allclose(column(human, "novice_action"), EXPERT / 2, atol=0.05)
-    assert np.allclose(2 * column(novice, "action"), column(novice, "next_observation/") - column(novice, "observation/"), atol=1e-5)
+    assert np.allclose(
+        2 * column(novice, "action"), column(novice, "next_observation/") - column(novice, "observation/"), atol=1e-5
+    )
     assert model.counts["human_steps"] == 5 and model.counts["takeovers"] == 3
 
 
@@ -253,14 +256,17 @@ def test_the_first_error_is_the_one_to_be_seen(algorithm):
 def test_the_human_never_drives_an_evaluation(algorithm):
     drivers = {"train": NoisyDriver(), "evaluation": NoisyDriver()}
     env, evaluation = (
-        DummyVecEnv([lambda driver=driver: InterventionWrapper(Limited(limit=5), driver, "always")]) for driver in drivers.values()
+        DummyVecEnv([lambda driver=driver: InterventionWrapper(Limited(limit=5), driver, "always")])
+        for driver in drivers.values()
     )
     seen = []
 
     class Evaluate(BaseCallback):
         def _on_step(self):
             if self.num_timesteps == 10:
-                evaluate_policy(self.model, evaluation, 2, callback=lambda local, _: seen.append(local["info"]["takeover"]), warn=False)
+                evaluate_policy(
+                    self.model, evaluation, 2, callback=lambda local, _: seen.append(local["info"]["takeover"]), warn=False
+                )
             return True
 
     model = make_guided(algorithm, env).learn(15, callback=Evaluate())
@@ -272,13 +278,13 @@ def test_the_human_never_drives_an_evaluation(algorithm):
     assert len(drivers["train"].observations) == asked
 
 
-@each_algorithm
-def test_works_in_subprocesses(algorithm):
-    env = SubprocVecEnv([lambda: InterventionWrapper(Limited(), constant, Witness("01" * 9))] * 2, start_method="fork")
+def test_works_in_subprocesses():
+    """Nothing of a wrapper need be sent but what it says (not with fork, which may hang once torch has its threads)."""
+    env = SubprocVecEnv([lambda: InterventionWrapper(Limited(), constant, Witness("01" * 9))] * 2)
     try:
-        model = make_guided(algorithm, env).learn(12)
+        model = make_guided(DPVP, env).learn(12)
         assert len(model.replay_buffer.human) == 6
-        assert env.get_attr("state") == ["autonomous"] * 2
+        assert env.get_attr("armed") == [False] * 2
         assert model.wrapper_states == [{"human_steps": 3, "total_steps": 6}] * 2
     finally:
         env.close()
@@ -318,12 +324,9 @@ def test_counts_are_dealt_out_to_another_number_of_environments(algorithm, n_bef
 # --- Saving and loading
 
 
-@each_algorithm
-@pytest.mark.parametrize("stage", [1, 2])
+@pytest.mark.parametrize("algorithm, stage", [(PVP, 1), (DPVP, 1), (CHAC, 1), (CHAC, 2)])
 def test_training_goes_on_as_if_never_saved(algorithm, stage, tmp_path):
     """Networks, targets, optimizers, the phase of the policy delay, both stores and where their rings stand."""
-    if stage == 2 and algorithm is not CHAC:
-        pytest.skip("has one stage")
     kwargs = {"switch_after": 25} if stage == 2 else {}
     model = make_guided(algorithm, scripted("0011" * 99), buffer_size=25, **kwargs).learn(61)
     assert model._n_updates == 41
@@ -453,10 +456,11 @@ def test_options(algorithm, name, tmp_path):
 def test_returns_of_several_steps_reach_the_stores(algorithm):
     model = make_guided(algorithm, scripted("00110", "11000", limit=5), n_steps=3, gamma=0.5).learn(10)
     novice, human = stores(model)
-    # The reward of step t is t: (1 + 2 / 2), (2); (3 + 4 / 2 + 5 / 4) ... each until the driver or the episode changes
-    assert sorted(column(novice, "reward")) == [2, 2, 5, 3 + 4 / 2 + 5 / 4, 4 + 5 / 2, 5][:2] + sorted([5, 6.25, 6.5, 5])
-    assert sorted(column(human, "reward")) == [2, 2, 4, 5]
-    assert sorted(column(human, "discount")) == [0.25, 0.25, 0.5, 0.5][:0] + [0.25, 0.25, 0.5, 0.5]
+    # The reward of step t is t; each return ends with the driver or the episode
+    assert sorted(column(human, "reward")) == sorted([3 + 4 / 2, 4, 1 + 2 / 2, 2])
+    assert sorted(column(human, "discount")) == [0.25, 0.25, 0.5, 0.5]
+    assert sorted(column(novice, "reward")) == sorted([1 + 2 / 2, 2, 5, 3 + 4 / 2 + 5 / 4, 4 + 5 / 2, 5])
+    assert not column(novice, "done").any()  # the time limit
 
 
 class Camera(Limited):
@@ -566,8 +570,13 @@ def test_actions_of_any_shape(algorithm):
         ({"prefit_steps": -1}, [CHAC]),
         ({"bootstrap": "guided"}, [CHAC]),
         ({"stage2_human_share": 1.5}, [CHAC]),
+        ({"weight_decay": -1.0}, [DPVP, CHAC]),
+        ({"average_tau": 1.5}, [DPVP, CHAC]),
+        ({"anchor_coef": -1.0}, [CHAC]),
     ],
-    ids=lambda value: "-".join(f"{k}={getattr(v, '__name__', v)}" for k, v in value.items()) if isinstance(value, dict) else "",
+    ids=lambda value: (
+        "-".join(f"{k}={getattr(v, '__name__', v)}" for k, v in value.items()) if isinstance(value, dict) else ""
+    ),
 )
 def test_bad_arguments(kwargs, algorithms):
     (name,) = kwargs
@@ -626,9 +635,11 @@ def test_nan_is_never_stored(algorithm):
 
 @pytest.mark.parametrize("algorithm", [PVP, DPVP])
 def test_reaches_the_expert(algorithm):
-    """Without reward, in 1500 steps of a task in which the best action is a function of the state."""
+    """Without reward, in 800 steps of a task in which the best action is a function of the state."""
     env = DummyVecEnv([lambda: InterventionWrapper(Tracking(), tracking_expert, "disagreement")])
-    kwargs = dict(learning_rate=1e-3, batch_size=64, gamma=0.5, buffer_size=2000, policy_kwargs=dict(net_arch=[64, 64]))
+    policy_kwargs = dict(net_arch=[64, 64], activation_fn=th.nn.ReLU)
+    kwargs = dict(learning_rate=1e-3, batch_size=64, gamma=0.5, policy_kwargs=policy_kwargs)
+    kwargs |= {} if algorithm is PVP else {"average_tau": 0.01, "weight_decay": 0.0}
     model = make_guided(algorithm, env, learning_starts=50, **kwargs)
     obs = np.random.default_rng(0).uniform(-1, 1, (500, 2)).astype(np.float32)
 
@@ -636,7 +647,8 @@ def test_reaches_the_expert(algorithm):
         return np.sqrt(np.mean((model.predict(obs, deterministic=True)[0] - tracking_expert(obs)) ** 2, axis=1))
 
     before = errors()
-    model.learn(1500)
+    model.learn(800)
     after = errors()
-    assert after.mean() < 0.6 * before.mean()
-    assert (after < 0.3).mean() > 0.7  # the rule's threshold
+    assert after.mean() < 0.4 * before.mean()
+    assert (after < 0.3).mean() > 0.9  # the threshold of the rule
+    assert model.counts["human_steps"] < 400

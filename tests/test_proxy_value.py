@@ -98,7 +98,9 @@ NEARLY = np.zeros((6, 2))
 NEARLY[[1, 3, 4]] = [[0.1, 0.1], [0.2 * 2**0.5, 0], [-0.4, 0.4]]
 
 
-@pytest.mark.parametrize("pv_min_diff, differ", [(0.0, [1] * 6), (0.15, [1, 0, 1, 1, 1, 1]), (0.3, [1, 0, 1, 0, 1, 1]), (9, [0] * 6)])
+@pytest.mark.parametrize(
+    "pv_min_diff, differ", [(0.0, [1] * 6), (0.15, [1, 0, 1, 1, 1, 1]), (0.3, [1, 0, 1, 0, 1, 1]), (9, [0] * 6)]
+)
 def test_pvp_min_diff(pv_min_diff, differ):
     batch = mixed_batch()
     batch = batch._replace(novice_actions=batch.actions + th.as_tensor(NEARLY, dtype=th.float32))

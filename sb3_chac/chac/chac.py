@@ -302,6 +302,7 @@ class CHAC(DPVP):
             check_range("tau_c", self.tau_c, low=0.0, high=1.0)
         check_integer("prefit_steps", self.prefit_steps, low=0)
         check_range("stage2_human_share", self.stage2_human_share, low=0.0, high=1.0)
+        check_range("anchor_coef", self.anchor_coef, low=0.0)
         if self.bootstrap not in ("executed", "self"):
             raise ValueError(f"bootstrap must be 'executed' or 'self', got {self.bootstrap!r}.")
 
@@ -351,7 +352,8 @@ class CHAC(DPVP):
                 ent_coef,
                 lambda actions: self.anchor_coef * (actions - guided_actions).square().sum(dim=1),
             )
-            self.self_update(self.tau)
+            if (self._n_updates // self.policy_delay) % self.target_update_interval == 0:
+                self.self_update(self.tau)
             self.self_average_update(self.average_tau)
         return stats
 

@@ -62,6 +62,8 @@ class CHACPolicy(DPVPPolicy):
         self.confidence_critic, self.confidence_critic_target = (self.make_critic() for _ in range(2))
         self.self_actor, self.self_actor_target, self.averaged_self_actor = (self.make_actor() for _ in range(3))
         self.confidence_critic_target.load_state_dict(self.confidence_critic.state_dict())
+        # Its features extractor is its own, whatever the critic of pi_g does: nothing but the loss of Z_c teaches it
+        self.confidence_critic.share_features_extractor = False
         for network in (self.confidence_critic, self.self_actor):
             network.optimizer = self.optimizer_class(
                 network.parameters(),
@@ -89,7 +91,8 @@ class CHACPolicy(DPVPPolicy):
         q_guided, std_guided = critic.pessimistic(observation, guided_actions)
         scaled = self.sigma_scale * std_self, self.sigma_scale * std_guided
         confidence = probability_of_improvement(q_self, scaled[0], q_guided, scaled[1])
-        self_drives = confidence > 1 - self.delta
+        # For delta 1 also where the confidence is too small for a float
+        self_drives = (confidence > 1 - self.delta) | (self.delta == 1)
         actions = th.where(self_drives.unsqueeze(1), self_actions, guided_actions)
         return Choice(actions, self_drives, confidence, q_self, q_guided, std_self, std_guided)
 

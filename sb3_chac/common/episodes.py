@@ -49,10 +49,11 @@ def make_env(env: str | EnvSpec | Callable[..., gym.Env], env_kwargs: dict[str, 
 
 
 class SavedModel(NamedTuple):
-    """A model on its way to another process."""
+    """A model on its way to another process. ``control`` is C-HAC's (``CHACPolicy``), which the archive does not hold."""
 
     algorithm: type[BaseAlgorithm]
     archive: bytes
+    control: str | None = None
 
     def load(self, env: gym.Env) -> BaseAlgorithm:
         """
@@ -60,7 +61,10 @@ class SavedModel(NamedTuple):
         :return: the model, on the CPU, fit for acting only
         """
         env_of_model = DummyVecEnv([lambda: env])
-        return self.algorithm.load(io.BytesIO(self.archive), env_of_model, device="cpu", custom_objects=NOT_FOR_ACTING)
+        model = self.algorithm.load(io.BytesIO(self.archive), env_of_model, device="cpu", custom_objects=NOT_FOR_ACTING)
+        if self.control is not None:
+            model.policy.control = self.control  # type: ignore[assignment]
+        return model
 
 
 class ModelDriver:

@@ -18,6 +18,7 @@ from stable_baselines3.common.vec_env.base_vec_env import CloudpickleWrapper
 from tqdm import tqdm
 
 import sb3_chac
+from sb3_chac.chac import CHAC
 from sb3_chac.common.checks import check_integer
 from sb3_chac.common.episodes import DrivenPath, NotEvaluable, Runner, SavedModel, Task
 
@@ -29,6 +30,7 @@ METRICS = {
     "route_completion": "route completion",
     "steps": "steps",
 }
+DIGITS = {"return": 1, "cost": 2, "success": 2, "route_completion": 2, "steps": 0}  # behind the point, in ``compare``
 
 
 @dataclass
@@ -72,13 +74,17 @@ class Evaluation:
                 lines.append(f"  {title:<17}{summary[name]:>10.3f} ± {std:.3f}")
         return "\n".join(lines)
 
+    def to_dict(self) -> dict[str, Any]:
+        """
+        :return: summary, settings and records; what an episode does not have is left out
+        """
+        return {**self.summary(), **self.settings, "records": self.records}
+
     def to_json(self) -> str:
         """
-        :return: summary, settings and records as strict JSON (no NaN); what an episode does not have is left out
+        :return: ``to_dict`` as strict JSON (no NaN)
         """
-        return json.dumps(
-            {**self.summary(), **self.settings, "records": self.records}, indent=2, allow_nan=False, default=repr
-        )
+        return json.dumps(self.to_dict(), indent=2, allow_nan=False, default=repr)
 
 
 def evaluate(
@@ -127,7 +133,7 @@ def evaluate(
     with Runner(task) as runner:  # finds what does not fit, before any process is started
         results = list(tqdm(_episodes(runner, numbers, jobs), total=len(numbers), disable=not progress_bar, unit="episode"))
     settings = {
-        "policy": policy if isinstance(policy, str) else getattr(policy, "__name__", type(policy).__name__),
+        "policy": policy_name(policy),
         "env": env if isinstance(env, str) else getattr(env, "__name__", repr(env)),
         "env_kwargs": env_kwargs or {},
         "normalized": normalize is not None,
@@ -140,6 +146,41 @@ def evaluate(
     }
     records, paths = zip(*results, strict=True)
     return Evaluation(list(records), settings, list(paths) if record_paths else [])
+
+
+def policy_name(policy: BaseAlgorithm | str | Callable[[Any], Any]) -> str:
+    """
+    :return: what to call it; of a C-HAC model it says who acts, e.g. "CHAC (shared)"
+    """
+    if isinstance(policy, str):
+        return policy
+    name = getattr(policy, "__name__", type(policy).__name__)
+    if isinstance(policy, CHAC):
+        return f"{name} ({'guided' if policy.stage == 1 else policy.policy.control})"
+    return name
+
+
+def compare(evaluations: list[Evaluation]) -> str:
+    """
+    :param evaluations: on the same episodes
+    :return: a table to read, a line per policy
+    """
+    summaries = [evaluation.summary() for evaluation in evaluations]
+    columns = [["policy", *(evaluation.settings["policy"] for evaluation in evaluations)]]
+    for key, title in METRICS.items():
+        mean = "success_rate" if key == "success" else f"{key}_mean"
+        if all(mean in summary for summary in summaries):
+            cells = [f"{summary[mean]:.{DIGITS[key]}f}" for summary in summaries]
+            if key != "success":  # its spread follows from it
+                cells = [f"{cell} ± {s[f'{key}_std']:.{DIGITS[key]}f}" for cell, s in zip(cells, summaries, strict=True)]
+            columns.append([title, *cells])
+    widths = [max(map(len, column)) for column in columns]
+    title = f"{evaluations[0].settings['env']}, {len(evaluations[0].records)} episodes each, mean ± std"
+    lines = [
+        "  ".join([row[0].ljust(widths[0]), *(cell.rjust(width) for cell, width in zip(row[1:], widths[1:], strict=True))])
+        for row in zip(*columns, strict=True)
+    ]
+    return "\n".join([title, *lines])
 
 
 def scenario_list(scenarios: Iterable[int] | str) -> list[int]:
@@ -175,7 +216,8 @@ def _episodes(runner: Runner, numbers: list[int], jobs: int) -> Iterator[tuple[d
     if isinstance(task.policy, BaseAlgorithm):
         archive = io.BytesIO()
         task.policy.save(archive)
-        task = task._replace(policy=SavedModel(type(task.policy), archive.getvalue()))
+        control = task.policy.policy.control if isinstance(task.policy, CHAC) else None
+        task = task._replace(policy=SavedModel(type(task.policy), archive.getvalue(), control))
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(min(jobs, len(numbers)), context, _start_process, (CloudpickleWrapper(task),)) as pool:
         yield from pool.map(_run_episode, numbers)

@@ -1,3 +1,5 @@
+import io
+import pathlib
 import warnings
 from typing import Any, ClassVar, TypeVar
 
@@ -5,7 +7,7 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule, TensorDict
 
 from sb3_chac.common.buffers import DualReplayBuffer, DualReplayBufferSamples, take_rows
 from sb3_chac.common.checks import check_range
@@ -234,9 +236,21 @@ class DPVP(GuidedOffPolicyAlgorithm, DSAC):
         self._fill_in_preset()
         super()._setup_model()
         self.average_update = TargetUpdate(self.actor, self.policy.averaged_actor)
+        self._set_weight_decay()
+
+    def _set_weight_decay(self) -> None:
         for optimizer in (self.actor.optimizer, self.critic.optimizer):
             for group in optimizer.param_groups:
                 group["weight_decay"] = self.weight_decay
+
+    def set_parameters(
+        self,
+        load_path_or_dict: str | pathlib.Path | io.BufferedIOBase | TensorDict,
+        exact_match: bool = True,
+        device: th.device | str = "auto",
+    ) -> None:
+        super().set_parameters(load_path_or_dict, exact_match, device)
+        self._set_weight_decay()  # an argument: the optimizers' state holds the one that they were saved with
 
     def _fill_in_preset(self) -> None:
         if self.preset not in self.presets:
@@ -253,6 +267,8 @@ class DPVP(GuidedOffPolicyAlgorithm, DSAC):
         check_range("pv_coef", self.pv_coef, low=0.0)
         check_range("pv_min_diff", self.pv_min_diff, low=0.0)
         check_range("weight_decay", self.weight_decay, low=0.0)
+        if self.weight_decay > 0 and self.policy_kwargs.get("optimizer_class", th.optim.AdamW) is not th.optim.AdamW:
+            raise ValueError("weight_decay needs the optimizer AdamW, the default: pass weight_decay=0 for another one.")
         check_range("average_tau", self.average_tau, low=0.0, high=1.0)
         if self.eta_pv is not None:
             check_range("eta_pv", self.eta_pv, low=0.0, exclusive_low=True)

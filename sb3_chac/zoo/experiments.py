@@ -10,7 +10,12 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+from stable_baselines3.common.callbacks import ProgressBarCallback
+
+import sb3_chac
+from sb3_chac.common.callbacks import PROGRESS_FILE, CSVProgress, GuidedProgressBar
 from sb3_chac.common.checkpoints import ResumableCheckpoint, checkpoint_step
+from sb3_chac.common.guided import GuidedOffPolicyAlgorithm
 from sb3_chac.envs import ENVIRONMENTS, VALIDATION
 from sb3_chac.zoo.registration import ALGORITHMS, hyperparams_file
 
@@ -65,10 +70,20 @@ def preprocess_hyperparams(original: Callable[..., Any], manager: Any, hyperpara
 
 
 def create_callbacks(original: Callable[..., None], manager: Any) -> None:
-    """Our algorithms write checkpoints to resume from, except in trials of Optuna and with ``--save-freq 0``."""
+    """
+    Our algorithms write progress.csv and, except with ``--save-freq 0``, checkpoints to resume from (neither in trials of
+    Optuna). The progress bar of those that learn from takeovers tells what the human does.
+    """
     save_freq = manager.save_freq  # it is changed
     original()
-    if manager.algo in ALGORITHMS and not manager.optimize_hyperparameters and save_freq != 0:
+    if manager.algo not in ALGORITHMS or manager.optimize_hyperparameters:
+        return
+    if issubclass(getattr(sb3_chac, ALGORITHMS[manager.algo]), GuidedOffPolicyAlgorithm):
+        manager.callbacks[:] = [
+            GuidedProgressBar() if type(callback) is ProgressBarCallback else callback for callback in manager.callbacks
+        ]
+    manager.callbacks.append(CSVProgress(Path(manager.save_path, PROGRESS_FILE)))
+    if save_freq != 0:
         save_freq = save_freq if save_freq > 0 else SAVE_FREQ
         manager.callbacks.append(ResumableCheckpoint(save_freq, manager.save_path, manager.env_name))
 

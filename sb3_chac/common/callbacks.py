@@ -1,0 +1,105 @@
+"""What is shown and written while one of our algorithms learns."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.progress import BarColumn, TimeRemainingColumn
+from stable_baselines3.common.callbacks import BaseCallback, ProgressBarCallback
+from stable_baselines3.common.logger import CSVOutputFormat
+from tqdm.rich import FractionColumn, tqdm
+
+from sb3_chac.common.guided import GuidedOffPolicyAlgorithm
+
+PROGRESS_FILE = "progress.csv"
+
+
+class GuidedProgressBar(ProgressBarCallback):
+    """
+    SB3's progress bar which also tells, for an algorithm that learns from takeovers, what the human does: the stage of the
+    training (C-HAC), the share and number of steps that the human drove and the safety cost, since the start of the training;
+    and in stage 2 the share of the latest steps that the self-learning policy drove.
+
+    :param refresh_every: number of calls between two updates of the text
+    """
+
+    model: GuidedOffPolicyAlgorithm
+
+    def __init__(self, refresh_every: int = 100):
+        super().__init__()
+        self.refresh_every = refresh_every
+        self.self_share: float | None = None
+
+    def _on_training_start(self) -> None:
+        # Less beside the text than SB3's, it is to fit into 80 columns
+        columns = ("{task.description}", BarColumn(bar_width=None), FractionColumn(), TimeRemainingColumn())
+        total = self.locals["total_timesteps"] - self.model.num_timesteps
+        self.pbar = tqdm(total=total, desc=self.text(), progress=columns)
+
+    def _on_step(self) -> bool:
+        if self.n_calls % self.refresh_every == 0:
+            self.pbar.set_description_str(self.text(), refresh=False)
+        return super()._on_step()
+
+    def _on_training_end(self) -> None:
+        self.pbar.set_description_str(self.text(), refresh=False)
+        super()._on_training_end()
+
+    def text(self) -> str:
+        """
+        :return: e.g. "stage 2, self 31 %, human 12 % (1850 steps), cost 9"
+        """
+        counts = self.model.counts
+        parts = [f"stage {self.model.stage}"] if hasattr(self.model, "stage") else []
+        choices: dict[str, list[np.ndarray]] = getattr(self.model, "choices", {})
+        if choices:  # else the logger has just taken them
+            self.self_share = float(np.mean(choices["self_drives"][-self.refresh_every :]))
+        if self.self_share is not None:
+            parts.append(f"self {100 * self.self_share:.0f} %")
+        rate = counts["human_steps"] / max(counts["total_steps"], 1)
+        parts.append(f"human {100 * rate:.0f} % ({counts['human_steps']:.0f} steps)")
+        return ", ".join([*parts, f"cost {counts['safety_cost']:g}"])
+
+
+class CSVProgress(BaseCallback):
+    """
+    Also writes what the logger gets as CSV, a row each time it is dumped. It adds rows when the training starts and ends and
+    when a stage begins: they tell the runs of a training apart, and its stages, to the step.
+
+    :param file: is overwritten
+    """
+
+    def __init__(self, file: str | Path):
+        super().__init__()
+        self.file = Path(file)
+        self.output: CSVOutputFormat | None = None
+        self.stage: int | None = None
+
+    def _on_training_start(self) -> None:
+        self.output = CSVOutputFormat(str(self.file))
+        self.logger.output_formats.append(self.output)
+        self.stage = getattr(self.model, "stage", None)
+        self._add_row(self.output)
+
+    def _on_step(self) -> bool:
+        stage = getattr(self.model, "stage", None)
+        if self.output is not None and stage != self.stage:
+            self.stage = stage
+            self._add_row(self.output)
+        return True
+
+    def _on_training_end(self) -> None:
+        if self.output is not None:  # RL-Zoo3 may end a training twice
+            self._add_row(self.output)
+            self.logger.output_formats.remove(self.output)
+            self.output.close()
+            self.output = None
+
+    def _add_row(self, output: CSVOutputFormat) -> None:
+        row: dict[str, Any] = {"time/total_timesteps": self.model.num_timesteps}
+        if self.stage is not None:
+            row["chac/stage"] = self.stage
+        if isinstance(self.model, GuidedOffPolicyAlgorithm):
+            row["takeover/human_steps"] = self.model.counts["human_steps"]
+            row["safety/safety_cost"] = self.model.counts["safety_cost"]
+        output.write(row, {})
