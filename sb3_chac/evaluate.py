@@ -255,11 +255,12 @@ def guess_algorithm(path: Path, module: str, stored: set[str], algorithms: dict[
         for algo, algorithm in algorithms.items()
         if module in {policy.__module__ for policy in algorithm.policy_aliases.values()}
     ]
-    if set(candidates) != {"ddpg", "td3"}:  # DDPG stores what TD3 stores
-        best = [algo for algo in candidates if fit(algo) == max(map(fit, candidates))]
-        if len(best) == 1:
-            return best[0]
-        candidates = best or list(algorithms)
+    best = [algo for algo in candidates if fit(algo) == max(map(fit, candidates))]
+    if "td3" in best:
+        best = ["ddpg", "td3"]  # DDPG stores what TD3 stores
+    if len(best) == 1:
+        return best[0]
+    candidates = best or list(algorithms)
     folders = {folder.name for folder in path.resolve().parents[:2]}
     named = [
         algo for algo in candidates if algo in folders or path.stem == algo or path.name.startswith((f"{algo}-", f"{algo}_"))
