@@ -28,7 +28,14 @@ SWITCH_AFTER, TOTAL = 250, 600
 TRAIN = [
     *("--algo", "chac", "--env", "SafeDrive-v0", "-n", str(TOTAL), "--save-freq", "100", "--eval-freq", "300"),
     *("--eval-episodes", "1", "-f", "logs", "--seed", "1", "--env-kwargs", "horizon:60", "blocks:2"),
-    *("-params", "learning_starts:50", "buffer_size:1000", "batch_size:32", "policy_kwargs:dict(net_arch=[8])"),
+    *(
+        "-params",
+        "learning_starts:50",
+        "train_freq:1",
+        "buffer_size:1000",
+        "batch_size:32",
+        "policy_kwargs:dict(net_arch=[8])",
+    ),
     *(f"switch_after:{SWITCH_AFTER}", "prefit_steps:5"),
 ]
 

@@ -55,7 +55,7 @@ class CHACPolicy(DPVPPolicy):
         self.control = control
         self.last_choice: Choice | None = None
         # Saved with the parameters: a loaded policy acts as it did
-        self.register_buffer("stage", th.tensor(1, device=self.device))
+        self.register_buffer("stage", th.tensor(1.0, device=self.device))
 
     def _build(self, lr_schedule: Schedule) -> None:
         super()._build(lr_schedule)
