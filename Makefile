@@ -46,6 +46,10 @@ bench: $(INSTALLED)
 	$(BIN)/python benchmarks/safedrive.py learn --jobs 2
 	$(BIN)/python benchmarks/safedrive.py report
 	$(BIN)/python benchmarks/dagger.py --hidden 512
+	$(BIN)/python benchmarks/guidance.py run --jobs 2
+	$(BIN)/python benchmarks/guidance.py report
+	$(BIN)/python benchmarks/guidance.py agents
+	$(BIN)/python benchmarks/guidance.py cost
 
 $(INSTALLED): setup.cfg pyproject.toml constraints.txt build_hooks.py sb3_chac.pth sb3_chac.start
 	python3 -m venv $(VENV)

@@ -15,10 +15,11 @@ anew. Models go to --models.
 import argparse
 import csv
 import importlib.metadata
+import io
 import json
 import multiprocessing
-import shutil
 import time
+import zipfile
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -64,6 +65,15 @@ METHODS = {
     "chac": Method("chac", 200_000, "C-HAC", {}, "chac-stage-1"),
     "chac-no-share": Method("chac", 200_000, "C-HAC, No Share", {"shared_control": False}, "chac-stage-1"),
     "chac-no-confidence": Method("chac", 200_000, "C-HAC, No Confidence", {"delta": 0.5}, "chac-stage-1"),
+}
+
+# What of a policy acts when deterministic
+ACTING = {
+    "sac": ("actor.",),
+    "dsac": ("actor.",),
+    "pvp": ("actor.",),
+    "dpvp": ("averaged_actor.",),
+    "chac": ("actor.", "averaged_actor.", "averaged_self_actor.", "confidence_critic."),
 }
 
 
@@ -236,13 +246,30 @@ def agents(args: argparse.Namespace) -> None:
     """Of each method, the seed whose last evaluation is the median of the returns."""
     folder = HERE / "agents"
     folder.mkdir(exist_ok=True)
-    for name, method in METHODS.items():
-        seeds = [seed for seed in args.seeds if is_finished(args.results / f"{name}-{seed}.csv", method)]
-        if seeds and name in ("sac", "dsac", "pvp", "dpvp", "chac"):
+    for name, networks in ACTING.items():
+        seeds = [seed for seed in args.seeds if is_finished(args.results / f"{name}-{seed}.csv", METHODS[name])]
+        if seeds:
             seeds.sort(key=lambda seed: float(read(args.results / f"{name}-{seed}.csv")[-1]["return_mean"]))
             chosen = seeds[(len(seeds) - 1) // 2]
-            shutil.copy(args.models / f"{name}-{chosen}.zip", folder / f"{name}-SafeDrive-v0.zip")
+            slim(args.models / f"{name}-{chosen}.zip", folder / f"{name}-SafeDrive-v0.zip", networks)
             print(f"{name}: seed {chosen}")
+
+
+def slim(source: Path, target: Path, networks: tuple[str, ...]) -> None:
+    """Keeps what acts when deterministic. All else becomes zeros, which take no room, and the optimizers lose their state."""
+    with zipfile.ZipFile(source) as old, zipfile.ZipFile(target, "w", zipfile.ZIP_DEFLATED) as new:
+        for name in old.namelist():
+            content = old.read(name)
+            if name.endswith(".pth"):
+                state = th.load(io.BytesIO(content), weights_only=False)
+                if name == "policy.pth":
+                    state = {k: v if k.startswith((*networks, "stage")) else th.zeros_like(v) for k, v in state.items()}
+                elif name.endswith("optimizer.pth"):
+                    state["state"] = {}
+                buffer = io.BytesIO()
+                th.save(state, buffer)
+                content = buffer.getvalue()
+            new.writestr(name, content)
 
 
 if __name__ == "__main__":

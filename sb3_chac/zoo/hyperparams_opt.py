@@ -54,8 +54,9 @@ def sample_chac_params(trial: optuna.Trial, n_actions: int, n_envs: int, additio
     """
     confidence = {
         "delta": trial.suggest_float("delta", 0.05, 0.5),
-        "sigma_scale": trial.suggest_float("sigma_scale", 0.01, 1.0, log=True),
+        "sigma_scale": trial.suggest_float("sigma_scale", 0.003, 1.0, log=True),
         "tau_c": trial.suggest_float("tau_c", 0.005, 0.05, log=True),
+        "anchor_coef": trial.suggest_float("anchor_coef", 1.0, 100.0, log=True),
     }
     return convert_offpolicy_params(_suggest_dpvp(trial) | confidence)
 
@@ -80,7 +81,11 @@ def _suggest_guided(trial: optuna.Trial) -> dict[str, Any]:
 
 
 def _suggest_dpvp(trial: optuna.Trial) -> dict[str, Any]:
-    return _suggest_guided(trial) | {"ent_coef": trial.suggest_float("ent_coef", 1e-4, 0.05, log=True)}
+    return _suggest_guided(trial) | {
+        "ent_coef": trial.suggest_float("ent_coef", 1e-4, 0.05, log=True),
+        "weight_decay": trial.suggest_float("weight_decay", 0.1, 10.0, log=True),
+        "average_tau": trial.suggest_float("average_tau", 2e-4, 0.02, log=True),
+    }
 
 
 HYPERPARAMS_SAMPLER: dict[str, Callable[..., dict[str, Any]]] = {
