@@ -3,7 +3,6 @@ from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch as th
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
@@ -61,41 +60,8 @@ class CHAC(DPVP):
     anchor_coef         20          0
     ==================  ==========  =======
 
-    :param policy: The policy model to use (MlpPolicy, CnnPolicy, MultiInputPolicy)
-    :param env: The environment to learn from (if registered in Gym, can be str), with a bounded Box action space
-    :param learning_rate: learning rate of the actor and the critics,
-        it can be a function of the current progress remaining (from 1 to 0)
-    :param buffer_size: capacity of each of the two stores, in transitions
-    :param learning_starts: how many steps of the model to collect transitions for before learning starts
-    :param batch_size: Minibatch size for each gradient update
-    :param tau: the soft update coefficient of the target networks (between 0 and 1)
-    :param gamma: the discount factor
-    :param train_freq: Update the model every ``train_freq`` steps. Alternatively pass a tuple of frequency and unit
-        like ``(5, "step")`` or ``(2, "episode")``.
-    :param gradient_steps: How many gradient steps to do after each rollout (see ``train_freq``)
-        Set to ``-1`` means to do as many gradient steps as steps done in the environment during the rollout.
-    :param action_noise: the action noise type (None by default), added to the sampled action
-    :param replay_buffer_class: ``DualReplayBuffer``, or a class derived from it
-    :param replay_buffer_kwargs: Keyword arguments to pass to the replay buffer on creation.
-    :param optimize_memory_usage: not supported, must be False
-    :param n_steps: number of rewards in a return; it ends early where the driver changes
-    :param ent_coef: Entropy regularization coefficient alpha. Set it to 'auto' to learn it
-        (and 'auto_0.1' for using 0.1 as initial value)
-    :param target_update_interval: update the target networks every ``target_update_interval`` actor updates
-    :param target_entropy: target entropy when learning ``ent_coef``, 'auto' is minus the number of actions
-    :param ent_coef_lr: learning rate of the entropy coefficient, can be a schedule too
-    :param policy_delay: gradient steps of the critics per update of the actor, the entropy coefficient and all targets
-    :param eta: weight of sigma^2 in the critic's loss; sigma^2 shrinks as 1 / eta, 1 keeps it calibrated
-    :param tau_b: coefficient of the running mean of sigma that scales and clips the critic's loss; ``tau`` if None
-    :param preset: "default" or "paper", see above
-    :param proxy_value: B, the label of the human's actions; minus B is the label of the novice's
-    :param pv_coef: weight of the labels
-    :param pv_min_diff: no label -B where the root mean square of a_h - a_n, both in [-1, 1], is smaller
-    :param bounded_targets: whether the targets of Z_g are clipped to [-B, B]
-    :param weight_decay: of pi_g and Z_g, relative to the learning rate (decoupled, as in AdamW)
-    :param average_tau: coefficient of the running mean of pi_g's parameters; 1 is pi_g itself
-    :param eta_pv: weight of sigma^2 in the loss of the labels, ``eta`` if None
-    :param takeover_stop_td: leave temporal differences out on the first step of a takeover
+    The parameters are those of ``DPVP``, and:
+
     :param delta: pi_r acts where P(Q_r > Q_g) is above 1 - delta. 0 leaves pi_g alone, 0.5 compares the means (the ablation
         "No Confidence")
     :param shared_control: if False, pi_r always acts in stage 2 (the ablation "No Share")
@@ -111,22 +77,6 @@ class CHAC(DPVP):
     :param stage2_human_share: share of the human's transitions in the batches of stage 2
     :param anchor_coef: weight of the squared distance between the actions of pi_r and pi_g, both in [-1, 1], in pi_r's loss;
         in units of the return
-    :param use_sde: Whether to use generalized State Dependent Exploration (gSDE)
-        instead of action noise exploration (default: False)
-    :param sde_sample_freq: Sample a new noise matrix every n steps when using gSDE
-        Default: -1 (only sample at the beginning of the rollout)
-    :param use_sde_at_warmup: Whether to use gSDE instead of uniform sampling
-        during the warm up phase (before learning starts)
-    :param stats_window_size: Window size for the rollout logging, specifying the number of episodes to average
-        the reported success rate, mean episode length, and mean reward over
-    :param tensorboard_log: the log location for tensorboard (if None, no logging)
-    :param policy_kwargs: additional arguments to be passed to the policy on creation, see ``DSACPolicy``
-    :param verbose: Verbosity level: 0 for no output, 1 for info messages (such as device or wrappers used), 2 for
-        debug messages
-    :param seed: Seed for the pseudo random generators
-    :param device: Device (cpu, cuda, ...) on which the code should be run.
-        Setting it to auto, the code will be run on the GPU if possible.
-    :param _init_setup_model: Whether or not to build the network at the creation of the instance
     :raises ValueError: for an argument out of its range, an action space that is not a bounded Box, or, while learning,
         an observation or reward that is NaN or infinite
     """
@@ -314,17 +264,9 @@ class CHAC(DPVP):
     def _needs_human(self) -> bool:
         return self.stage == 1
 
-    def _setup_learn(
-        self,
-        total_timesteps: int,
-        callback: MaybeCallback = None,
-        reset_num_timesteps: bool = True,
-        tb_log_name: str = "run",
-        progress_bar: bool = False,
-    ) -> tuple[int, BaseCallback]:
-        prepared = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
+    def _prepare_wrappers(self) -> None:
+        super()._prepare_wrappers()
         self._show_stage()
-        return prepared
 
     def _show_stage(self) -> None:
         if self.env is not None and self.env.has_attr("set_stage"):
@@ -352,7 +294,7 @@ class CHAC(DPVP):
                 ent_coef,
                 lambda actions: self.anchor_coef * (actions - guided_actions).square().sum(dim=1),
             )
-            if (self._n_updates // self.policy_delay) % self.target_update_interval == 0:
+            if self._targets_are_due():
                 self.self_update(self.tau)
             self.self_average_update(self.average_tau)
         return stats

@@ -82,7 +82,7 @@ class GuidedOffPolicyAlgorithm(CheckedOffPolicyAlgorithm):
         if reset_num_timesteps or self._last_obs is None:  # the environments are about to be reset
             self._forget_episodes()
         prepared = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
-        self._restore_wrappers()
+        self._prepare_wrappers()
         if self._needs_human():
             self._arm()
         return prepared
@@ -107,7 +107,7 @@ class GuidedOffPolicyAlgorithm(CheckedOffPolicyAlgorithm):
         self._disarm()
         return self
 
-    def _restore_wrappers(self) -> None:
+    def _prepare_wrappers(self) -> None:
         """Wrappers that are new go on with the counts of those before them."""
         assert self.env is not None
         if not self.wrapper_states or not self.env.has_attr("load_state_dict"):

@@ -61,32 +61,13 @@ class DPVP(GuidedOffPolicyAlgorithm, DSAC):
     average_tau      0.0005     1
     ===============  =========  =======
 
-    :param policy: The policy model to use (MlpPolicy, CnnPolicy, MultiInputPolicy)
-    :param env: The environment to learn from (if registered in Gym, can be str), with a bounded Box action space
-    :param learning_rate: learning rate of the actor and the critics,
-        it can be a function of the current progress remaining (from 1 to 0)
+    The parameters are those of ``DSAC``, and:
+
     :param buffer_size: capacity of each of the two stores, in transitions
-    :param learning_starts: how many steps of the model to collect transitions for before learning starts
-    :param batch_size: Minibatch size for each gradient update
-    :param tau: the soft update coefficient of the target networks (between 0 and 1)
-    :param gamma: the discount factor
-    :param train_freq: Update the model every ``train_freq`` steps. Alternatively pass a tuple of frequency and unit
-        like ``(5, "step")`` or ``(2, "episode")``.
-    :param gradient_steps: How many gradient steps to do after each rollout (see ``train_freq``)
-        Set to ``-1`` means to do as many gradient steps as steps done in the environment during the rollout.
-    :param action_noise: the action noise type (None by default), added to the sampled action
     :param replay_buffer_class: ``DualReplayBuffer``, or a class derived from it
-    :param replay_buffer_kwargs: Keyword arguments to pass to the replay buffer on creation.
     :param optimize_memory_usage: not supported, must be False
     :param n_steps: number of rewards in a return; it ends early where the driver changes
-    :param ent_coef: Entropy regularization coefficient alpha. Set it to 'auto' to learn it
-        (and 'auto_0.1' for using 0.1 as initial value)
-    :param target_update_interval: update the target networks every ``target_update_interval`` actor updates
-    :param target_entropy: target entropy when learning ``ent_coef``, 'auto' is minus the number of actions
-    :param ent_coef_lr: learning rate of the entropy coefficient, can be a schedule too
-    :param policy_delay: gradient steps of the critics per update of the actor, the entropy coefficient and all targets
-    :param eta: weight of sigma^2 in the critic's loss; sigma^2 shrinks as 1 / eta, 1 keeps it calibrated
-    :param tau_b: coefficient of the running mean of sigma that scales and clips the critic's loss; ``tau`` if None
+    :param policy_kwargs: additional arguments to be passed to the policy on creation, see ``DPVPPolicy``
     :param preset: "default" or "paper", see above
     :param proxy_value: B, the label of the human's actions; minus B is the label of the novice's
     :param pv_coef: weight of the labels
@@ -96,22 +77,6 @@ class DPVP(GuidedOffPolicyAlgorithm, DSAC):
     :param average_tau: coefficient of the running mean of pi_g's parameters; 1 is pi_g itself
     :param eta_pv: weight of sigma^2 in the loss of the labels, ``eta`` if None
     :param takeover_stop_td: leave temporal differences out on the first step of a takeover
-    :param use_sde: Whether to use generalized State Dependent Exploration (gSDE)
-        instead of action noise exploration (default: False)
-    :param sde_sample_freq: Sample a new noise matrix every n steps when using gSDE
-        Default: -1 (only sample at the beginning of the rollout)
-    :param use_sde_at_warmup: Whether to use gSDE instead of uniform sampling
-        during the warm up phase (before learning starts)
-    :param stats_window_size: Window size for the rollout logging, specifying the number of episodes to average
-        the reported success rate, mean episode length, and mean reward over
-    :param tensorboard_log: the log location for tensorboard (if None, no logging)
-    :param policy_kwargs: additional arguments to be passed to the policy on creation, see ``DSACPolicy``
-    :param verbose: Verbosity level: 0 for no output, 1 for info messages (such as device or wrappers used), 2 for
-        debug messages
-    :param seed: Seed for the pseudo random generators
-    :param device: Device (cpu, cuda, ...) on which the code should be run.
-        Setting it to auto, the code will be run on the GPU if possible.
-    :param _init_setup_model: Whether or not to build the network at the creation of the instance
     :raises ValueError: for an argument out of its range, an action space that is not a bounded Box, or, while learning,
         an observation or reward that is NaN or infinite
     """
@@ -278,19 +243,13 @@ class DPVP(GuidedOffPolicyAlgorithm, DSAC):
                 "Use a fixed coefficient of about 0.01 times proxy_value."
             )
 
-    def _gradient_step(self, batch: DualReplayBufferSamples) -> dict[str, th.Tensor]:
-        ent_coef = self.log_ent_coef.detach().exp()
-        stats = self._update_proxy_critic(batch, ent_coef)
-        if self._n_updates % self.policy_delay == 0:
-            stats |= self._update_actor(self.actor, self.critic, batch.observations, ent_coef)
-            if (self._n_updates // self.policy_delay) % self.target_update_interval == 0:
-                for update in self.target_updates:
-                    update(self.tau)
-            n_actor_updates = self._n_updates // self.policy_delay
-            self.average_update(max(self.average_tau, 1 / n_actor_updates))
+    def _update_policy(self, batch: DualReplayBufferSamples, ent_coef: th.Tensor) -> dict[str, th.Tensor]:
+        stats = super()._update_policy(batch, ent_coef)
+        n_actor_updates = self._n_updates // self.policy_delay
+        self.average_update(max(self.average_tau, 1 / n_actor_updates))
         return stats
 
-    def _update_proxy_critic(self, batch: DualReplayBufferSamples, ent_coef: th.Tensor) -> dict[str, th.Tensor]:
+    def _update_critic(self, batch: DualReplayBufferSamples, ent_coef: th.Tensor) -> dict[str, th.Tensor]:
         # Temporal differences without reward
         no_rewards = th.zeros_like(batch.rewards.flatten())
         targets = self._return_targets(self.actor_target, self.critic_target, batch, no_rewards, ent_coef)

@@ -270,17 +270,26 @@ class DSAC(CheckedOffPolicyAlgorithm):
         :return: what to log, scalars
         """
         ent_coef = self.log_ent_coef.detach().exp()
-        # Optimize the critics
+        stats = self._update_critic(batch, ent_coef)
+        if self._n_updates % self.policy_delay == 0:
+            stats |= self._update_policy(batch, ent_coef)
+        return stats
+
+    def _update_critic(self, batch: Any, ent_coef: th.Tensor) -> dict[str, th.Tensor]:
         targets = self._return_targets(self.actor_target, self.critic_target, batch, batch.rewards.flatten(), ent_coef)
         losses, _, stats = self._critic_losses(self.critic, batch, targets)
         minimize(losses.mean(dim=1).sum(), self.critic.optimizer)
-
-        if self._n_updates % self.policy_delay == 0:
-            stats |= self._update_actor(self.actor, self.critic, batch.observations, ent_coef)
-            if (self._n_updates // self.policy_delay) % self.target_update_interval == 0:
-                for update in self.target_updates:
-                    update(self.tau)
         return stats
+
+    def _update_policy(self, batch: Any, ent_coef: th.Tensor) -> dict[str, th.Tensor]:
+        stats = self._update_actor(self.actor, self.critic, batch.observations, ent_coef)
+        if self._targets_are_due():
+            for update in self.target_updates:
+                update(self.tau)
+        return stats
+
+    def _targets_are_due(self) -> bool:
+        return (self._n_updates // self.policy_delay) % self.target_update_interval == 0
 
     @th.no_grad()
     def _return_targets(
