@@ -63,8 +63,8 @@ METHODS = {
     "dpvp": Method("dpvp", SWITCH, "D-PVP"),
     "chac-stage-1": Method("chac", SWITCH, "C-HAC, end of stage 1"),
     "chac": Method("chac", 200_000, "C-HAC", {}, "chac-stage-1"),
-    "chac-no-share": Method("chac", 200_000, "C-HAC, No Share", {"shared_control": False}, "chac-stage-1"),
-    "chac-no-confidence": Method("chac", 200_000, "C-HAC, No Confidence", {"delta": 0.5}, "chac-stage-1"),
+    "chac-no-share": Method("chac", 100_000, "C-HAC, No Share", {"shared_control": False}, "chac-stage-1"),
+    "chac-no-confidence": Method("chac", 100_000, "C-HAC, No Confidence", {"delta": 0.5}, "chac-stage-1"),
 }
 
 # What of a policy acts when deterministic

@@ -22,12 +22,14 @@ from sb3_chac.chac.policies import CONTROLS
 from sb3_chac.common import pictures
 from sb3_chac.common.episodes import NotEvaluable, Runner, SavedModel, Task, make_env
 from sb3_chac.common.evaluation import Evaluation, compare, evaluate, scenario_list
+from sb3_chac.envs import ENVIRONMENTS
 from sb3_chac.zoo.registration import add_algorithms
 
+DEFAULT_ENV = "SafeDrive-v0"
 DESCRIPTION = """Run one deterministic episode per scenario and print return, safety cost, success rate, route completion
 and steps, as mean ± standard deviation over the episodes. The results do not depend on --jobs.
 
-  sb3-chac evaluate logs/chac/SafeDrive-v0_1/best_model.zip --env SafeDrive-v0 --scenarios 1000:1050 --json chac.json
+  sb3-chac evaluate logs/chac/SafeDrive-v0_1/best_model.zip --scenarios 1000:1050 --json chac.json
   sb3-chac evaluate logs/chac/SafeDrive-v0_1/SafeDrive-v0.zip --beside guided self scripted
   sb3-chac evaluate --expert scripted --scenarios 1000:1012 --plot paths.png --video drive.mp4
   sb3-chac evaluate logs/sac/Pendulum-v1_1/Pendulum-v1.zip --env Pendulum-v1 --episodes 20
@@ -55,7 +57,9 @@ def make_parser() -> argparse.ArgumentParser:
     )
     where = parser.add_argument_group("where")
     where.add_argument(
-        "--env", default="SafeDrive-v0", metavar="ID", help="environment, also module:ID (default: %(default)s)"
+        "--env",
+        metavar="ID",
+        help=f"environment, also module:ID (default: ours that MODEL.zip is called after, else {DEFAULT_ENV})",
     )
     where.add_argument("--env-kwargs", nargs="+", default=[], metavar="KEY:VALUE", help="passed to it, Python literals")
     count = where.add_mutually_exclusive_group()
@@ -103,6 +107,7 @@ def run(args: argparse.Namespace) -> None:
     :raises FileNotFoundError: if the model, or the folder of an output file, does not exist
     :raises NotEvaluable: for whatever else does not fit, found before the episodes run
     """
+    args.env = args.env or env_of(args.model)
     check_output("--json", args.json)
     check_output("--plot", args.plot, pictures.PLOT_SUFFIXES)
     check_output("--video", args.video, pictures.VIDEO_SUFFIXES)
@@ -168,6 +173,15 @@ def run(args: argparse.Namespace) -> None:
             pictures.save_video(args.video, runner, filmed)
     for file in filter(None, (args.json, args.plot, args.video)):
         print(f"Saved {file}")
+
+
+def env_of(model: Path | None) -> str:
+    """
+    :param model: a file such as logs/chac/SafeDrive-v0_1/best_model.zip or chac-SafeDrive-v0.zip
+    :return: the first of our environments whose name occurs in that of the file or of its folder, else ``DEFAULT_ENV``
+    """
+    names = f"{model.absolute().parent.name}/{model.name}" if model else ""
+    return next((env for env in ENVIRONMENTS if env in names), DEFAULT_ENV)
 
 
 def check_output(option: str, path: Path | None, suffixes: tuple[str, ...] = ()) -> None:

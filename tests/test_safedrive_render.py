@@ -9,6 +9,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+from sb3_chac.envs import display
 from sb3_chac.envs.safedrive import SafeDriveEnv
 from sb3_chac.envs.safedrive import render as rendering
 from sb3_chac.envs.safedrive.geometry import wrap_angle
@@ -40,7 +41,7 @@ def test_frame_shows_ego_on_its_route(blocks):
     env = make(blocks=blocks, until=0.3, traffic_density=0, obstacle_density=0)
     frame = env.render()
     assert frame.shape == (600, 800, 3) and frame.dtype == np.uint8
-    assert closest(frame, env._viewer.to_picture(env.ego.position), rendering.EGO, within=8) < 20
+    assert closest(frame, env._viewer.to_picture(env.ego.position), display.EGO, within=8) < 20
     beside = env.map.route[int((env.s + 12) / 0.5)]
     right = beside[:2] + 1.5 * np.array([-np.sin(beside[2]), np.cos(beside[2])])
     assert closest(frame, env._viewer.to_picture(right), rendering.COLOURS["route"]) < 8
@@ -83,7 +84,7 @@ def test_no_kerb_across_junction():
                 assert np.abs(frame[y, x].astype(int) - rendering.COLOURS["kerb"]).max() > 40
 
 
-OBSTACLES = {"cone": rendering.ORANGE, "triangle": rendering.RED, "parked": rendering.PARKED}
+OBSTACLES = {"cone": display.ORANGE, "triangle": display.RED, "parked": display.PARKED}
 
 
 @pytest.mark.parametrize("kind", OBSTACLES)
@@ -107,7 +108,7 @@ def test_traffic_and_wrecks_have_their_colours():
     while not (near := np.linalg.norm(env.traffic.positions - env.ego.position, axis=1) < 35).any():
         assert not any(env.step(driver())[2:4])
     car = int(env.traffic.visible[near][0])
-    for colour in (rendering.TRAFFIC, rendering.WRECK):
+    for colour in (display.TRAFFIC, rendering.WRECK):
         frame = env.render()
         place = env._viewer.to_picture(env.box_positions[env.box_ids.index(("car", car))])
         assert closest(frame, place, colour, within=8) < 20
@@ -138,14 +139,14 @@ def test_hud_shows_what_wrappers_tell():
     env.hud = {**env.hud, "takeover": True}
     human = env.render()
     assert np.array_equal(plain[300:], told[300:]) and not np.array_equal(plain[:200, :300], told[:200, :300])
-    assert closest(human, env._viewer.to_picture(env.ego.position), rendering.HUMAN, within=8) < 20
+    assert closest(human, env._viewer.to_picture(env.ego.position), display.HUMAN, within=8) < 20
 
 
 def test_collision_flashes():
     env = make()
     before = env.render()
     env._touched[("car", 0)] = env.steps
-    assert (env.render()[-3, 400] == rendering.RED).all() and not (before[-3, 400] == rendering.RED).all()
+    assert (env.render()[-3, 400] == display.RED).all() and not (before[-3, 400] == display.RED).all()
 
 
 def test_lidar_on_request():

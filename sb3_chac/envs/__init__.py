@@ -3,10 +3,15 @@
 from gymnasium.envs.registration import register, registry
 
 # Name -> where it is
-ENVIRONMENTS = {"SafeDrive-v0": "sb3_chac.envs.safedrive:SafeDriveEnv"}
+ENVIRONMENTS = {
+    "SafeDrive-v0": "sb3_chac.envs.safedrive:SafeDriveEnv",
+    "MetaDriveSafety-v0": "sb3_chac.envs.metadrive:MetaDriveSafetyEnv",
+}
 # Name -> keyword arguments for evaluations while something is being trained or tuned, on maps that are neither those of the
 # training (100-119) nor those of the final test (1000-1049)
-VALIDATION = {"SafeDrive-v0": {"start_scenario": 2000, "num_scenarios": 50}}
+VALIDATION = {name: {"start_scenario": 2000, "num_scenarios": 50} for name in ENVIRONMENTS}
+# Of which a process can have one only
+ONE_PER_PROCESS = {"MetaDriveSafety-v0"}
 
 for _name, _entry_point in ENVIRONMENTS.items():
     if _name not in registry:

@@ -16,7 +16,7 @@ import sb3_chac
 from sb3_chac.common.callbacks import PROGRESS_FILE, CSVProgress, GuidedProgressBar
 from sb3_chac.common.checkpoints import ResumableCheckpoint, checkpoint_step
 from sb3_chac.common.guided import GuidedOffPolicyAlgorithm
-from sb3_chac.envs import ENVIRONMENTS, VALIDATION
+from sb3_chac.envs import ENVIRONMENTS, ONE_PER_PROCESS, VALIDATION
 from sb3_chac.zoo.registration import ALGORITHMS, hyperparams_file
 
 # Steps between two checkpoints unless --save-freq says otherwise: what a person does at most for nothing
@@ -45,14 +45,16 @@ def _wrapped(original: Callable[..., Any], around: Callable[..., Any]) -> Callab
 
 def init(original: Callable[..., None], manager: Any, *args: Any, **kwargs: Any) -> None:
     """
-    Our hyperparameters, unless others are named; and other seeds than those that a checkpoint began with: the episodes are not
-    to be the same again.
+    Our hyperparameters, unless others are named; subprocesses for environments that need them; and other seeds than those that
+    a checkpoint began with: the episodes are not to be the same again.
     """
     arguments = inspect.signature(original).bind(*args, **kwargs).arguments
     algo = arguments["algo"]
     if not arguments.get("config") and (algo in ALGORITHMS or arguments["env_id"] in ENVIRONMENTS):
         with contextlib.suppress(FileNotFoundError):  # then RL-Zoo3 says itself that it has none either
             arguments["config"] = str(hyperparams_file(algo))
+    if arguments["env_id"] in ONE_PER_PROCESS:
+        arguments["vec_env_type"] = "subproc"
     done = checkpoint_step(arguments.get("trained_agent", "")) if algo in ALGORITHMS else None
     if done is not None:
         arguments["seed"] = (arguments.get("seed", 0) + done) % 2**32

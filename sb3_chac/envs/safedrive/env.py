@@ -9,6 +9,7 @@ from gymnasium import spaces
 from highway_env.road.road import Road
 
 from sb3_chac.common.checks import check_integer, check_range
+from sb3_chac.envs.display import STEPS_PER_SECOND
 from sb3_chac.envs.safedrive.driver import IMPERFECTIONS, ScriptedDriver
 from sb3_chac.envs.safedrive.geometry import SPACING, Pose, boxes_overlap, wrap_angle
 from sb3_chac.envs.safedrive.lidar import Lidar
@@ -16,7 +17,7 @@ from sb3_chac.envs.safedrive.map import BLOCKS, HALF_WIDTH, LANES, OBSTACLE_SIZE
 from sb3_chac.envs.safedrive.traffic import CAR_LENGTH, CAR_WIDTH, Traffic
 from sb3_chac.envs.safedrive.vehicle import MAX_SPEED, Ego
 
-STEPS_PER_SECOND, SUBSTEPS = 10, 2
+SUBSTEPS = 2
 ARRIVES_BEFORE_END = 5.0  # [m]
 CHECKPOINTS = np.array([8.0, 16.0, 26.0, 38.0, 50.0])  # [m] ahead on the route
 N_EGO, N_NAVIGATION = 9, 2 * len(CHECKPOINTS)

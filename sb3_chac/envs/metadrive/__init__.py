@@ -1,0 +1,3 @@
+from sb3_chac.envs.metadrive.env import PRESETS, MetaDriveSafetyEnv
+
+__all__ = ["PRESETS", "MetaDriveSafetyEnv"]

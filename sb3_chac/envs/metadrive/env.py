@@ -1,0 +1,281 @@
+"""MetaDriveSafety-v0: the simulator of the paper's experiments behind the interface of SafeDrive."""
+
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+
+from sb3_chac.common.checks import check_integer, check_range
+from sb3_chac.envs.display import STEPS_PER_SECOND
+from sb3_chac.envs.metadrive.drivers import DRIVERS, make_driver
+from sb3_chac.envs.metadrive.simulator import check_installed, is_headless, make_simulator, prepare, release
+
+N_OBSERVATION = 259
+MAX_SCENARIO = 1_000_000
+CONTACT_MEMORY = 10  # steps without contact after which touching the same object is a new collision
+# MetaDrive's, which are lost if any of them is changed
+SPAWN = {
+    "use_special_color": True,
+    "spawn_lane_index": (">", ">>", 0),
+}
+FULL_BRAKE = 1.5  # [m/s] that braking with all its might takes off the speed in a step, at least
+
+
+class Preset(NamedTuple):
+    """A published protocol. Both: maps of three blocks, accidents in four of five, collisions do not end the episode."""
+
+    num_scenarios: int
+    traffic_density: float
+    max_speed: float  # [km/h]
+    horizon: int  # [steps]
+
+
+PRESETS = {
+    "chac": Preset(num_scenarios=20, traffic_density=0.08, max_speed=35.0, horizon=2000),
+    "pvp": Preset(num_scenarios=50, traffic_density=0.06, max_speed=80.0, horizon=1500),
+}
+
+
+class MetaDriveSafetyEnv(gym.Env):
+    """
+    MetaDrive's SafeMetaDriveEnv: drive through seeded maps of three blocks among traffic, cones, warning triangles, barriers
+    and broken-down vehicles; ten decisions per second. One environment per process (see ``EngineInUse``).
+
+    **Actions**, shape (2,), in [-1, 1]: steering (1 is 40 degrees of the front wheels to the left) and throttle or brake.
+
+    **Observations**, shape (259,), in [0, 1]: MetaDrive's: 9 of the ego (distances to the left and the right edge, heading,
+    speed, steering, last action, yaw rate, offset in the lane), 10 of the next two checkpoints, and 240 lidar rays up to 50 m
+    (1 is free).
+
+    **Reward**: MetaDrive's: metres along the lane + 0.1 v / v_max, but on a step in contact with something -5 in its place, on
+    arrival +10, off the road or the route -5.
+
+    **Cost** (``info["cost"]``): 1 per collision, counted when a contact begins. ``info["contact_cost"]`` is MetaDrive's own: 1
+    on each step in contact with something, and for leaving the road.
+
+    **Ends** (terminated): at the destination, off the road or off the route. Truncated after ``horizon`` steps.
+
+    **Info**: as SafeDrive's (``cost``, ``collision``, ``contact``, ``out_of_road``, ``arrive_dest``, ``is_success``,
+    ``route_completion``, ``speed`` [m/s], ``episode_cost``, ``scenario``), and ``contact_cost``.
+
+    ``reset(options={"scenario": k})`` drives map k; otherwise the map is drawn from ``start_scenario``,
+    ``start_scenario`` + 1, ...
+
+    In MetaDrive 0.4.3 a vehicle that brakes at a standstill creeps backwards; here the brake takes no more speed off than
+    there is.
+
+    :param preset: "chac" (the paper's) or "pvp" (that of PVP's authors): ``PRESETS``; the arguments below override it
+    :param start_scenario: the first of the maps (by custom, training begins with 100, testing with 1000)
+    :param num_scenarios: number of maps
+    :param traffic_density: vehicles per 10 m of lane
+    :param max_speed: [km/h] of the ego
+    :param horizon: [steps of 0.1 s] after which an episode is truncated
+    :param headless: go without MetaDrive's assets, None to let the environment variable SB3_CHAC_METADRIVE_HEADLESS decide
+    :param render_mode: "rgb_array", "human" or None: seen from above
+    :raises ValueError: for an argument out of its range
+    :raises DependencyNotInstalled: without MetaDrive
+    :raises MissingAssets: see there
+    :raises EngineInUse: for a second environment in this process
+    """
+
+    metadata = {"render_modes": ["rgb_array", "human"], "render_fps": STEPS_PER_SECOND}  # noqa: RUF012
+
+    def __init__(
+        self,
+        preset: str = "chac",
+        start_scenario: int = 100,
+        num_scenarios: int | None = None,
+        traffic_density: float | None = None,
+        max_speed: float | None = None,
+        horizon: int | None = None,
+        headless: bool | None = None,
+        render_mode: str | None = None,
+    ) -> None:
+        if preset not in PRESETS:
+            raise ValueError(f"preset must be one of {sorted(PRESETS)}, got {preset!r}.")
+        given: dict[str, Any] = dict(
+            num_scenarios=num_scenarios, traffic_density=traffic_density, max_speed=max_speed, horizon=horizon
+        )
+        settings = PRESETS[preset]._replace(**{name: value for name, value in given.items() if value is not None})
+        check_integer("start_scenario", start_scenario, low=0)
+        check_integer("num_scenarios", settings.num_scenarios, low=1)
+        check_range("start_scenario + num_scenarios", start_scenario + settings.num_scenarios, high=MAX_SCENARIO)
+        check_range("traffic_density", settings.traffic_density, low=0.0, high=1.0)
+        check_range("max_speed", settings.max_speed, low=1.0, high=200.0)
+        check_integer("horizon", settings.horizon, low=1)
+        if render_mode is not None and render_mode not in self.metadata["render_modes"]:
+            raise ValueError(f"render_mode must be None or one of {self.metadata['render_modes']}, got {render_mode!r}.")
+        check_installed()
+        prepare(is_headless(headless))
+        self.start_scenario, self.num_scenarios = int(start_scenario), int(settings.num_scenarios)
+        self.horizon = int(settings.horizon)
+        self.render_mode = render_mode
+        self.hud: dict[str, Any] = {}  # what wrappers want to have shown beside the speed
+        self.action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
+        self.observation_space = spaces.Box(0.0, 1.0, (N_OBSERVATION,), np.float32)
+        self._viewer: Any = None
+        self.simulator = make_simulator(
+            self,
+            dict(
+                start_seed=0,
+                num_scenarios=MAX_SCENARIO,
+                map=3,
+                traffic_density=float(settings.traffic_density),
+                accident_prob=0.8,
+                out_of_route_done=True,
+                horizon=self.horizon,
+                agent_configs={"default_agent": {**SPAWN, "max_speed_km_h": float(settings.max_speed)}},
+            ),
+        )
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
+        """
+        :param options: {"scenario": k} to drive map k
+        :raises ValueError: if k is not an integer from 0 to 999,999
+        """
+        super().reset(seed=seed)
+        if options and "scenario" in options:
+            check_integer("options['scenario']", options["scenario"], low=0)
+            check_range("options['scenario']", options["scenario"], high=MAX_SCENARIO - 1)
+            self.scenario = int(options["scenario"])
+        else:
+            self.scenario = self.start_scenario + int(self.np_random.integers(self.num_scenarios))
+        observation, info = self.simulator.reset(seed=self.scenario)
+        self.steps, self.episode_cost, self.collisions = 0, 0, 0
+        self._touched: dict[Any, int] = {}  # object -> step of the last contact
+        if self.render_mode == "human":
+            self.render()
+        return self._clipped(observation), self._info(info)
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        steering, throttle = np.clip(np.asarray(action, dtype=float), -1.0, 1.0)
+        throttle = max(throttle, -max(self.forward_speed, 0.0) / FULL_BRAKE)
+        observation, reward, terminated, truncated, info = self.simulator.step([steering, throttle])
+        self.steps += 1
+        self._count_collisions(info)
+        if self.render_mode == "human":
+            self.render()
+        return self._clipped(observation), float(reward), bool(terminated), bool(truncated), self._info(info)
+
+    def _count_collisions(self, info: dict[str, Any]) -> None:
+        """
+        Those that begin.
+
+        :param info: MetaDrive's
+        """
+        self.collisions = 0
+        for name in self._touching(bool(info["crash_vehicle"]), bool(info["crash_object"])):
+            self.collisions += self.steps - self._touched.get(name, -CONTACT_MEMORY) >= CONTACT_MEMORY
+            self._touched[name] = self.steps
+        self.episode_cost += self.collisions
+
+    def _touching(self, vehicles: bool, objects: bool) -> set[str]:
+        """
+        :param vehicles: whether a vehicle touched the ego in this step
+        :param objects: whether an object did
+        :return: names of what did: what still does, or else the nearest of its kind
+        """
+        if not (vehicles or objects):
+            return set()
+        from metadrive.component.static_object.traffic_object import TrafficObject
+        from metadrive.component.vehicle.base_vehicle import BaseVehicle
+
+        engine, ego = self.simulator.engine, self.ego
+        names = set()
+        for kind, touched in ((BaseVehicle, vehicles), (TrafficObject, objects)):
+            if touched:
+                things = [thing for thing in engine.get_objects().values() if isinstance(thing, kind) and thing is not ego]
+                distances = [np.hypot(*(np.array(thing.position) - ego.position)) for thing in things]
+                near = [thing for thing, distance in zip(things, distances, strict=True) if distance < 15.0]
+                touching = [thing.name for thing in near if self._touches(thing)]
+                names |= set(touching or [things[int(np.argmin(distances))].name])
+        return names
+
+    def _touches(self, thing: Any) -> bool:
+        world = self.simulator.engine.physics_world.dynamic_world
+        return world.contactTestPair(self.ego.chassis.node(), thing.body).getNumContacts() > 0
+
+    def _info(self, info: dict[str, Any]) -> dict[str, Any]:
+        """
+        :param info: MetaDrive's
+        """
+        self.last_info = {
+            "cost": float(self.collisions),
+            "collision": self.collisions > 0,
+            "contact": bool(info["crash_vehicle"] or info["crash_object"]),
+            "out_of_road": bool(info["out_of_road"] and not info["arrive_dest"]),
+            "arrive_dest": bool(info["arrive_dest"]),
+            "is_success": bool(info["arrive_dest"]),
+            "route_completion": 1.0 if info["arrive_dest"] else float(np.clip(info["route_completion"], 0.0, 1.0)),
+            "speed": float(self.ego.speed),
+            "episode_cost": float(self.episode_cost),
+            "contact_cost": float(info["cost"]),
+            "scenario": self.scenario,
+        }
+        return dict(self.last_info)
+
+    @staticmethod
+    def _clipped(observation: np.ndarray) -> np.ndarray:
+        return np.clip(observation, 0.0, 1.0, dtype=np.float32)
+
+    @property
+    def ego(self) -> Any:
+        """MetaDrive's vehicle that the agent drives."""
+        return self.simulator.agent
+
+    @property
+    def forward_speed(self) -> float:
+        """[m/s], negative when going backwards."""
+        return float(np.dot(self.ego.velocity, self.ego.heading))
+
+    @property
+    def position(self) -> np.ndarray:
+        """[m] of the ego, shape (2,)."""
+        return np.array(self.ego.position, dtype=float)
+
+    def scripted_driver(self, name: str = "scripted") -> Any:
+        """
+        :param name: "scripted" (with a human's imperfections), "scripted-ideal" (without), "idm" or "ppo" (MetaDrive's own)
+        :return: a driver for this environment
+        :raises ValueError: for another name
+        """
+        if name not in DRIVERS:
+            raise ValueError(f"{name!r} is not a driver of MetaDriveSafety, choose from {sorted(DRIVERS)}.")
+        return make_driver(name, self)
+
+    # Pictures
+
+    def render(self) -> np.ndarray | None:
+        """
+        :return: the picture, shape (600, 800, 3), uint8, with render_mode "rgb_array", else None
+        :raises ResetNeeded: before the first reset
+        :raises RuntimeError: if render_mode is "human" and there is no display
+        """
+        if self.render_mode is None:
+            gym.logger.warn("render() does nothing without a render_mode, for example render_mode='rgb_array'.")
+            return None
+        if not hasattr(self, "steps"):
+            raise gym.error.ResetNeeded("Call reset() before render().")
+        if self._viewer is None:
+            from sb3_chac.envs.metadrive.render import Viewer
+
+            self._viewer = Viewer(self)
+        if self.render_mode == "rgb_array":
+            return self._viewer.frame()
+        self._viewer.show()
+        return None
+
+    def plot_map(self, axes: Any) -> None:
+        """
+        :param axes: of matplotlib, where the map of the current scenario is drawn, in metres
+        """
+        from sb3_chac.envs.metadrive.map import plot_map
+
+        plot_map(self, axes)
+
+    def close(self) -> None:
+        if self._viewer is not None:
+            self._viewer.close()
+            self._viewer = None
+        release(self)
