@@ -1,4 +1,4 @@
-"""What guidance is worth on SafeDrive-v0: SAC, DSAC, PVP, D-PVP, C-HAC and C-HAC's ablations, with the same evaluation.
+"""What guidance is worth: SAC, DSAC, PVP, D-PVP, C-HAC and C-HAC's ablations on SafeDrive-v0, with the same evaluation.
 
     python benchmarks/guidance.py run --jobs 2     # runs what is missing; stop and restart it at any time
     python benchmarks/guidance.py report           # prints the tables and draws the curves from the CSVs
@@ -7,9 +7,9 @@
 
 Hyperparameters are those of ``hyperparams/<algo>.yml``. Training maps 100-119; every evaluation is one deterministic episode
 on each of the maps 1000-1049, without the human. Seeds 0-2 are the reported ones; tuning is done on seeds from 100 and maps
-2000-2049. C-HAC and its ablations share their stage 1.
-One CSV per run is written to benchmarks/results/guidance/, a row per evaluation as it comes; a run that was cut off starts
-anew. Models go to --models.
+2000-2049. C-HAC and its ablations share their stage 1. With ``--env MetaDriveSafety-v0``, the same there.
+One CSV per run is written to benchmarks/results/guidance/ (guidance-metadrive/), a row per evaluation as it comes; a run that
+was cut off starts anew. Models go to --models.
 """
 
 import argparse
@@ -31,18 +31,20 @@ from rl_zoo3.utils import ALGOS, get_wrapper_class
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
 from sb3_chac import DSAC, InterventionWrapper
 from sb3_chac.common.evaluation import evaluate
 from sb3_chac.common.guided import GuidedOffPolicyAlgorithm
+from sb3_chac.envs import ONE_PER_PROCESS
 from sb3_chac.zoo.registration import hyperparams_file
 
 HERE = Path(__file__).parent
-RESULTS = HERE / "results" / "guidance"
-VERSIONS = " ".join(
-    f"{name}={importlib.metadata.version(name)}"
-    for name in ("torch", "stable-baselines3", "gymnasium", "highway-env", "numpy")
-)
+RESULTS = {
+    "SafeDrive-v0": HERE / "results" / "guidance",
+    "MetaDriveSafety-v0": HERE / "results" / "guidance-metadrive",
+}
+SIMULATORS = {"SafeDrive-v0": "highway-env", "MetaDriveSafety-v0": "metadrive-simulator"}
 TEST_MAPS, TUNING_MAPS = range(1000, 1050), range(2000, 2050)
 FIRST_TUNING_SEED = 100
 SWITCH = 50_000
@@ -77,36 +79,43 @@ ACTING = {
 }
 
 
-def make_model(algo: str, seed: int, **overrides: Any) -> BaseAlgorithm:
-    """As ``rl_zoo3 train --algo <algo> --env SafeDrive-v0`` makes it."""
-    params = yaml.safe_load(hyperparams_file(algo).read_text())["SafeDrive-v0"]
+def versions(env_id: str) -> str:
+    names = ("torch", "stable-baselines3", "gymnasium", SIMULATORS[env_id], "numpy")
+    return " ".join(f"{name}={importlib.metadata.version(name)}" for name in names)
+
+
+def make_model(algo: str, seed: int, env_id: str, **overrides: Any) -> BaseAlgorithm:
+    """As ``rl_zoo3 train --algo <algo> --env <env_id>`` makes it."""
+    params = yaml.safe_load(hyperparams_file(algo).read_text())[env_id]
     del params["n_timesteps"]
     wrapper = get_wrapper_class(params)
     params.pop("env_wrapper", None)
     policy_kwargs = eval(params.get("policy_kwargs", "dict()"), {"dict": dict, "th": th})
     if algo == "sac":  # the default of our policies; it changes the speed, not the result
         policy_kwargs["optimizer_kwargs"] = {"fused": True}
-    env = make_vec_env("SafeDrive-v0", seed=seed, wrapper_class=wrapper)
+    vec_env_cls = SubprocVecEnv if env_id in ONE_PER_PROCESS else DummyVecEnv
+    env = make_vec_env(env_id, seed=seed, wrapper_class=wrapper, vec_env_cls=vec_env_cls)
     return ALGOS[algo](env=env, seed=seed, device="cpu", **params | {"policy_kwargs": policy_kwargs} | overrides)
 
 
 class Record(BaseCallback):
     """Sums up the safety cost of the training, and appends a row to the CSV at each evaluation."""
 
-    def __init__(self, path: Path, labels: dict[str, Any], every: int, maps: range, training_cost: float):
+    def __init__(self, path: Path, labels: dict[str, Any], env_id: str, every: int, maps: range, training_cost: float):
         super().__init__()
+        self.env_id, self.versions = env_id, versions(env_id)
         self.path, self.labels, self.every, self.maps = path, labels, every, maps
         self.training_cost = training_cost
 
     def _on_step(self) -> bool:
         self.training_cost += sum(info["cost"] for info in self.locals["infos"])
         if self.num_timesteps % self.every == 0:
-            summary = evaluate(self.model, "SafeDrive-v0", self.maps).summary()
+            summary = evaluate(self.model, self.env_id, self.maps).summary()
             counts = getattr(self.model, "counts", {})
             row = {**self.labels, "step": self.num_timesteps, **{key: round(value, 4) for key, value in summary.items()}}
             row |= {"human_steps": int(counts.get("human_steps", 0)), "training_cost": int(self.training_cost)}
             row |= {"training_cost_human": int(counts.get("safety_cost_human", 0))}
-            row |= {"cpu_seconds": round(time.process_time()), "versions": VERSIONS}
+            row |= {"cpu_seconds": round(time.process_time()), "versions": self.versions}
             is_new = not self.path.exists()
             with self.path.open("a", newline="") as file:
                 writer = csv.DictWriter(file, list(row))
@@ -116,14 +125,14 @@ class Record(BaseCallback):
         return True
 
 
-def run(name: str, seed: int, every: int, results: Path, models: Path) -> str:
+def run(name: str, seed: int, every: int, results: Path, models: Path, env_id: str = "SafeDrive-v0") -> str:
     th.set_num_threads(1)
     method = METHODS[name]
     path = results / f"{name}-{seed}.csv"
     path.unlink(missing_ok=True)
     for folder in (results, models):
         folder.mkdir(parents=True, exist_ok=True)
-    model = make_model(method.algo, seed)
+    model = make_model(method.algo, seed, env_id)
     training_cost = 0.0
     if method.goes_on_from is not None:
         start = models / f"{method.goes_on_from}-{seed}.zip"
@@ -131,11 +140,12 @@ def run(name: str, seed: int, every: int, results: Path, models: Path) -> str:
         model.load_replay_buffer(start.with_suffix(".pkl"))
         training_cost = model.counts["safety_cost"]
     maps = TUNING_MAPS if seed >= FIRST_TUNING_SEED else TEST_MAPS
-    record = Record(path, {"method": name, "seed": seed}, every, maps, training_cost)
+    record = Record(path, {"method": name, "seed": seed}, env_id, every, maps, training_cost)
     model.learn(method.steps - model.num_timesteps, callback=record, reset_num_timesteps=method.goes_on_from is None)
     model.save(models / f"{name}-{seed}.zip")
     if any(other.goes_on_from == name for other in METHODS.values()):
         model.save_replay_buffer(models / f"{name}-{seed}.pkl")
+    model.get_env().close()
     return f"{name} seed {seed}: {time.process_time():.0f} CPU seconds"
 
 
@@ -161,7 +171,7 @@ def run_all(args: argparse.Namespace) -> None:
     context = multiprocessing.get_context("spawn")
     for go_on in (False, True):  # from what the first round leaves
         with ProcessPoolExecutor(args.jobs, mp_context=context, max_tasks_per_child=1) as pool:
-            futures = [pool.submit(run, *job, args.every, args.results, args.models) for job in missing(go_on)]
+            futures = [pool.submit(run, *job, args.every, args.results, args.models, args.env) for job in missing(go_on)]
             for future in as_completed(futures):
                 print(future.result(), flush=True)
 
@@ -205,10 +215,48 @@ def report(args: argparse.Namespace) -> None:
             (line,) = axis.plot(steps, curves.mean(axis=0), label=method.title)
             axis.fill_between(steps, curves.min(axis=0), curves.max(axis=0), color=line.get_color(), alpha=0.12)
             axis.set(title=titles.get(key, "safety cost of the training"), xlabel="environment steps")
+    (args.results / "ablation.json").write_text(json.dumps(report_switch(args), indent=2) + "\n")
     axes[0].legend(fontsize=7)
     figure.tight_layout()
     figure.savefig(args.results / "curves.png", dpi=90)
     (args.results / "summary.json").write_text(json.dumps(rows, indent=2) + "\n")
+
+
+def report_switch(args: argparse.Namespace) -> list[dict[str, Any]]:
+    """Table: what the switch to stage 2 costs in its first 50K steps, for C-HAC and its ablations (the paper's Figure 8)."""
+    print(
+        f"\n| to step {2 * SWITCH // 1000}K | seeds | lowest return | drop | lowest success | training cost since the switch |"
+    )
+    print("|---|---|---|---|---|---|")
+    rows = []
+    for name, method in METHODS.items():
+        if method.goes_on_from is None:
+            continue
+        drops = []
+        for seed in args.seeds:
+            before, after = args.results / f"{method.goes_on_from}-{seed}.csv", args.results / f"{name}-{seed}.csv"
+            if not is_finished(after, method):
+                continue
+            start, after_switch = read(before)[-1], [row for row in read(after) if int(row["step"]) <= 2 * SWITCH]
+            lowest = min(float(row["return_mean"]) for row in after_switch)
+            drops.append(
+                {
+                    "return": lowest,
+                    "drop": 1 - lowest / float(start["return_mean"]),
+                    "success": min(float(row["success_rate"]) for row in after_switch),
+                    "training_cost": float(after_switch[-1]["training_cost"]) - float(start["training_cost"]),
+                }
+            )
+        if drops:
+            means = {key: float(np.mean([drop[key] for drop in drops])) for key in drops[0]}
+            spread = {key: np.std([drop[key] for drop in drops], ddof=1) if len(drops) > 1 else 0.0 for key in means}
+            print(
+                f"| {method.title} | {len(drops)} | {means['return']:.0f} ± {spread['return']:.0f} | {means['drop']:.1%} "
+                f"| {means['success']:.2f} ± {spread['success']:.2f} "
+                f"| {means['training_cost']:.0f} ± {spread['training_cost']:.0f} |"
+            )
+            rows.append({"method": name, "seeds": len(drops), **means})
+    return rows
 
 
 class GuidedDSAC(GuidedOffPolicyAlgorithm, DSAC):
@@ -230,7 +278,12 @@ def cost(args: argparse.Namespace) -> None:
             start = time.process_time()
             model.learn(1000, reset_num_timesteps=False)
             rows.append(
-                {"part": part, "kind": name, "cpu_ms_per_step": round(time.process_time() - start, 4), "versions": VERSIONS}
+                {
+                    "part": part,
+                    "kind": name,
+                    "versions": versions("SafeDrive-v0"),
+                    "cpu_ms_per_step": round(time.process_time() - start, 4),
+                }
             )
     times = {name: [row["cpu_ms_per_step"] for row in rows if row["kind"] == name and row["part"] > 0] for name in models}
     ratios = np.array(times["guided"]) / np.array(times["plain"])
@@ -251,7 +304,7 @@ def agents(args: argparse.Namespace) -> None:
         if seeds:
             seeds.sort(key=lambda seed: float(read(args.results / f"{name}-{seed}.csv")[-1]["return_mean"]))
             chosen = seeds[(len(seeds) - 1) // 2]
-            slim(args.models / f"{name}-{chosen}.zip", folder / f"{name}-SafeDrive-v0.zip", networks)
+            slim(args.models / f"{name}-{chosen}.zip", folder / f"{name}-{args.env}.zip", networks)
             print(f"{name}: seed {chosen}")
 
 
@@ -279,7 +332,10 @@ if __name__ == "__main__":
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
     parser.add_argument("--every", type=int, default=10_000, help="steps between evaluations")
     parser.add_argument("--jobs", type=int, default=2, help="processes at once, one torch thread each")
-    parser.add_argument("--results", type=Path, default=RESULTS)
-    parser.add_argument("--models", type=Path, default=HERE / "models", help="not committed")
+    parser.add_argument("--env", choices=RESULTS, default="SafeDrive-v0")
+    parser.add_argument("--results", type=Path, help="default: see above")
+    parser.add_argument("--models", type=Path, help="not committed; default: benchmarks/models/<env>")
     arguments = parser.parse_args()
+    arguments.results = arguments.results or RESULTS[arguments.env]
+    arguments.models = arguments.models or HERE / "models" / arguments.env
     {"run": run_all, "report": report, "agents": agents, "cost": cost}[arguments.command](arguments)
