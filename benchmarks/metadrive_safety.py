@@ -1,0 +1,121 @@
+"""MetaDriveSafety-v0: how its drivers do.
+
+    python benchmarks/metadrive_safety.py drivers --jobs 2   # scripted drivers and MetaDrive's own on 100 maps; runs what is missing
+    python benchmarks/metadrive_safety.py report             # table of the means
+
+Needs MetaDrive (Python 3.11), goes without its assets; a script called metadrive.py would hide it. One row per preset, driver and map is appended to
+benchmarks/results/metadrive/drivers.csv. Maps: 1000-1099. None of these was used while tuning; that was done on maps
+3000-3199.
+"""
+
+import argparse
+import csv
+import importlib.metadata
+import multiprocessing
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from itertools import product
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import torch as th
+
+import sb3_chac.envs  # noqa: F401
+from sb3_chac.envs.metadrive import PRESETS
+
+DRIVERS_CSV = Path(__file__).parent / "results" / "metadrive" / "drivers.csv"
+VERSIONS = " ".join(
+    f"{name}={importlib.metadata.version(name)}"
+    for name in ("metadrive-simulator", "panda3d", "numpy", "torch", "stable-baselines3", "gymnasium")
+)
+DRIVERS = ("scripted", "scripted-ideal", "idm", "ppo")
+DRIVER_MAPS = range(1000, 1100)
+CHUNK = 5  # episodes after which a process writes its rows
+COLUMNS = {  # -> digits in the report
+    "success": 2,
+    "cost": 2,
+    "return": 1,
+    "contact_cost": 2,
+    "steps": 0,
+    "route_completion": 3,
+}
+
+
+def read() -> list[dict[str, str]]:
+    if not DRIVERS_CSV.exists():
+        return []
+    with DRIVERS_CSV.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def append(rows: list[dict]) -> None:
+    DRIVERS_CSV.parent.mkdir(parents=True, exist_ok=True)
+    with DRIVERS_CSV.open("a", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]))
+        if file.tell() == 0:
+            writer.writeheader()
+        writer.writerows(rows)
+
+
+def drive(env, driver, scenario: int) -> dict:
+    observation, _ = env.reset(options={"scenario": scenario})
+    driver.reset(scenario)
+    done, total, contact_cost = False, 0.0, 0.0
+    while not done:
+        observation, reward, terminated, truncated, info = env.step(driver(observation))
+        done, total, contact_cost = terminated or truncated, total + reward, contact_cost + info["contact_cost"]
+    return {
+        "scenario": scenario,
+        "return": round(total, 2),
+        "cost": int(info["episode_cost"]),
+        "contact_cost": int(contact_cost),
+        "success": int(info["is_success"]),
+        "out_of_road": int(info["out_of_road"]),
+        "route_completion": round(info["route_completion"], 4),
+        "steps": env.steps,
+    }
+
+
+def drive_some(preset: str, name: str, scenarios: list[int]) -> list[dict]:
+    th.set_num_threads(1)
+    env = gym.make("MetaDriveSafety-v0", preset=preset, headless=True).unwrapped
+    try:
+        driver = env.scripted_driver(name)
+        return [
+            {"preset": preset, "driver": name, **drive(env, driver, scenario), "versions": VERSIONS} for scenario in scenarios
+        ]
+    finally:
+        env.close()
+
+
+def drivers(args: argparse.Namespace) -> None:
+    there = {(row["preset"], row["driver"], int(row["scenario"])) for row in read()}
+    tasks = []
+    for name, preset in product(DRIVERS, PRESETS):
+        missing = [scenario for scenario in DRIVER_MAPS if (preset, name, scenario) not in there]
+        tasks += [(preset, name, missing[i : i + CHUNK]) for i in range(0, len(missing), CHUNK)]
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(args.jobs, mp_context=context) as pool:  # MetaDrive has one engine per process
+        for future in as_completed([pool.submit(drive_some, *task) for task in tasks]):
+            append(future.result())
+    report(args)
+
+
+def report(args: argparse.Namespace) -> None:
+    rows = read()
+    print("| preset | driver | episodes | " + " | ".join(name.replace("_", " ") for name in COLUMNS) + " |")
+    print("|---|---|---" + "|---" * len(COLUMNS) + "|")
+    for preset, name in product(PRESETS, DRIVERS):
+        here = [row for row in rows if (row["preset"], row["driver"]) == (preset, name)]
+        if here:
+            means = [f"{np.mean([float(row[key]) for row in here]):.{digits}f}" for key, digits in COLUMNS.items()]
+            print(f"| {preset} | {name} | {len(here)} | " + " | ".join(means) + " |")
+
+
+if __name__ == "__main__":
+    commands = {f.__name__: f for f in (drivers, report)}
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("command", choices=commands)
+    parser.add_argument("--jobs", type=int, default=2, help="processes at once, one torch thread each")
+    arguments = parser.parse_args()
+    commands[arguments.command](arguments)
