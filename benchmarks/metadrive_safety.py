@@ -1,11 +1,11 @@
 """MetaDriveSafety-v0: how its drivers do.
 
-    python benchmarks/metadrive_safety.py drivers --jobs 2   # scripted drivers and MetaDrive's own on 100 maps; runs what is missing
+    python benchmarks/metadrive_safety.py drivers --jobs 2   # its drivers on 100 maps; runs what is missing
     python benchmarks/metadrive_safety.py report             # table of the means
 
-Needs MetaDrive (Python 3.11), goes without its assets; a script called metadrive.py would hide it. One row per preset, driver and map is appended to
-benchmarks/results/metadrive/drivers.csv. Maps: 1000-1099. None of these was used while tuning; that was done on maps
-3000-3199.
+Needs MetaDrive (Python 3.11), goes without its assets. (A script called metadrive.py would hide it.) One row per preset,
+driver and map is appended to benchmarks/results/metadrive/drivers.csv. Maps: 1000-1099. None of these was used while
+tuning; that was done on maps 3000-3199.
 """
 
 import argparse
