@@ -98,15 +98,15 @@ class Route(Path):
         self.lane_width = float(roads[0][0].width)
         lanes = np.ones(len(self.s))  # side by side, without those that begin later or have ended
         for road, start, end in zip(roads, self.starts[:-1], self.starts[1:], strict=True):
-            on_it = (self.s >= start) & (self.s < end)
             for k, lane in enumerate(road[1:], start=1):
-                begin, left = road[0].local_coordinates(lane.start)
-                finish, right = road[0].local_coordinates(lane.end)
-                beside = max(abs(left - k * self.lane_width), abs(right - k * self.lane_width)) < 0.5
-                if beside and not hasattr(lane, "angle"):
-                    lanes[on_it & (self.s >= start + begin) & (self.s <= start + finish) & (lanes == k)] = k + 1
-                elif hasattr(lane, "angle"):
-                    lanes[on_it & (lanes == k)] = k + 1
+                begin, finish = 0.0, end - start  # circular lanes are there from end to end
+                if not hasattr(lane, "angle"):
+                    begin, left = road[0].local_coordinates(lane.start)
+                    finish, right = road[0].local_coordinates(lane.end)
+                    if max(abs(left - k * self.lane_width), abs(right - k * self.lane_width)) > 0.5:
+                        continue  # it comes from elsewhere
+                there = (self.s > start + begin - 0.1) & (self.s < min(start + finish, end))
+                lanes[there & (lanes == k)] = k + 1
         lanes[self.s >= self.starts[-1]] = len(roads[-1])
         self.left, self.right = -self.lane_width / 2, (lanes - 0.5) * self.lane_width  # [m] its edges
         self.targets = self.lane_width * np.arange(min(len(road) for road in roads))  # [m] middles of the lanes all along it
@@ -167,7 +167,7 @@ class ScriptedDriver:
         self.noise = np.zeros(2)
         self.seen: deque[Others] = deque(maxlen=self.reaction_delay + 1)
         self.boxed_in = 0.0  # [s] of standing
-        self.dawdled = 0.0  # [s] in which the ego stands or crawls although the driver would speed up
+        self.dawdled = 0.0  # [s] in which the ego stood or crawled although the driver would have sped up
         self._paths: dict[Any, Path] = {}  # of the traffic
 
     def __call__(self, observation: np.ndarray | None = None) -> np.ndarray:
@@ -179,7 +179,10 @@ class ScriptedDriver:
         self.seen.append(self._look(TIMES))
         target, slope, acceleration, cap = self._plan(self.seen[0])
         self.boxed_in = self.boxed_in + 0.1 if self.speed < 0.3 else max(0.0, self.boxed_in - 0.05)
-        self.dawdled = self.dawdled + 0.1 if self.speed < DAWDLING * cap and acceleration > 0 else 0.0
+        if self.speed < DAWDLING * cap and acceleration > 0:
+            self.dawdled = min(self.dawdled + 0.1, PATIENCE + 1.0)
+        else:
+            self.dawdled = max(self.dawdled - 0.1, 0.0)
         if acceleration > 0:
             acceleration = min(acceleration, 1.5 * (cap - self.speed))
         elif self.speed < 1.0:
@@ -264,7 +267,7 @@ class ScriptedDriver:
             curvature = float(route.curvature[route.index(s)])
             yaw_rate = speed * np.tan(steering) / WHEELBASE
             if time > 0.6:
-                yaw_rate = speed * np.clip(curvature - 0.1 * error, -0.3, 0.3)
+                yaw_rate = speed * np.clip(curvature - 0.2 * error, -0.3, 0.3)
             error += (yaw_rate - curvature * speed) * FEARED[0]
             lateral -= speed * np.sin(error) * FEARED[0]
             s += speed * np.cos(error) * FEARED[0]
@@ -278,11 +281,12 @@ class ScriptedDriver:
         curvature = self.route.curvature[self.route.index(self.s + ahead)]
         curvature = np.abs(curvature / (1 + curvature * self.lateral).clip(0.3))
         squares = LATERAL_ACCELERATION / np.maximum(curvature, 1e-3) + 2 * 1.5 * np.maximum(ahead - 2.0, 0.0)
-        return float(min(self.wanted_speed, np.sqrt(squares.min()))) / (1 + 4 * max(abs(self.error) - 0.3, 0.0))
+        return float(min(self.wanted_speed, np.sqrt(squares.min()))) / (1 + 8 * max(abs(self.error) - 0.3, 0.0))
 
     def _steering(self, target: float, slope: float) -> float:
         """Pure pursuit of a lateral target [m], approached with a slope; in [-1, 1]"""
         look = float(np.clip(0.3 * self.speed, 2.5, 8.0))
+        slope += max(np.sign(target - self.lateral) * self.error, 0.0)  # all the more if it heads the other way
         lateral = self.lateral + float(np.clip(target - self.lateral, -slope * look, slope * look))
         point, _ = self.route.poses(np.array(self.s + look), lateral)
         d = point - self.position + REAR_AXLE * np.array([np.cos(self.heading), np.sin(self.heading)])
@@ -295,19 +299,23 @@ class ScriptedDriver:
         """
         :param times: [s] from now, shape (m,)
         """
+        from metadrive.component.static_object.traffic_object import TrafficObject
+        from metadrive.component.vehicle.base_vehicle import BaseVehicle
+
         rows: list[tuple] = []
         for thing in self.env.simulator.engine.get_objects().values():
-            if thing is self.env.ego or not hasattr(thing, "heading_theta"):
+            if thing is self.env.ego or not isinstance(thing, BaseVehicle | TrafficObject):
                 continue
             position = np.array(thing.position, dtype=float)[:2]
             if max(abs(position - self.position)) > SIGHT:
                 continue
             heading = float(thing.heading_theta)
-            if hasattr(thing, "throttle_brake"):
+            if isinstance(thing, BaseVehicle):
                 for positions, headings, moves in self._futures(thing, position, heading, times):
                     rows.append((positions, headings, thing.LENGTH, thing.WIDTH, moves, position, heading))
             else:
-                size = (0.3, 2.0) if hasattr(thing, "top_down_length") and thing.LENGTH > 1 else (2 * thing.RADIUS,) * 2
+                # A barrier lies across its lane
+                size = (2 * thing.RADIUS,) * 2 if hasattr(thing, "RADIUS") else (thing.WIDTH, thing.LENGTH)
                 positions, headings = np.tile(position, (len(times), 1)), np.full(len(times), heading)
                 rows.append((positions, headings, *size, False, position, heading))
         if not rows:
@@ -401,16 +409,17 @@ class ScriptedDriver:
         # Who has begun to change lanes goes on
         here = np.argmin(np.abs(targets - (self.lateral - 10.0 * np.sin(self.error))))
         cost = cost + LANE_CHANGE_COST * np.abs(np.arange(len(targets)) - here)[:, None]
-        cost = cost + self._collision_cost(others, positions, headings)
+        cost = cost + self._collision_cost(others, positions, headings, speeds)
         # See to it early to be in a free lane
         cost += EARLY_COST * np.maximum(1 - gaps / EARLY, 0.0)[:, None]
         weight = np.exp((cost.min() - cost) / INDIFFERENCE)
         weight /= weight.sum()
         return float((weight * targets[:, None]).sum()), slope, float((weight * ACCELERATIONS).sum()), cap
 
-    def _collision_cost(self, others: Others, positions: np.ndarray, headings: np.ndarray) -> np.ndarray:
+    def _collision_cost(self, others: Others, positions: np.ndarray, headings: np.ndarray, speeds: np.ndarray) -> np.ndarray:
         """
         :param positions: of the plans, shape (target, acceleration, time, 2)
+        :param speeds: [m/s], shape (acceleration, time)
         :return: shape (target, acceleration)
         """
         if len(others.ahead) == 0:
@@ -430,8 +439,9 @@ class ScriptedDriver:
         hit &= ~(behind & moves & (np.abs(angle) < 0.3) & stays)  # who follows keeps the distance
         if self.boxed_in > BOXED_IN_FOR:  # nothing else helps: push through
             hit &= moves
-        first = np.where(hit.any(axis=-1), TIMES[np.argmax(hit, axis=-1)], np.inf)
-        collision = (60.0 / (0.3 + first)).sum(axis=0)
+        first = np.argmax(hit, axis=-1)
+        impact = 45.0 + 9.0 * speeds[np.arange(len(speeds)), first]
+        collision = np.where(hit.any(axis=-1), impact / (0.3 + TIMES[first]), 0.0).sum(axis=0)
         close = np.where((gap_along < 0.0) & (gap_across < 1.0), 1.0 - np.maximum(gap_across, 0.0), 0.0)
         collision += 8.0 * close.max(axis=-1).sum(axis=0)
         # Before something that stands in the way, keep the room to swing out

@@ -27,11 +27,18 @@ class EngineInUse(gym.error.Error):
 
 def check_installed() -> None:
     """
-    :raises DependencyNotInstalled: unless MetaDrive can be imported
+    :raises DependencyNotInstalled: unless MetaDrive and the pygame that it imports are there
     """
     if importlib.util.find_spec("metadrive") is None:
         raise gym.error.DependencyNotInstalled(
             f'MetaDriveSafety-v0 needs MetaDrive {VERSION} (Python 3.11): pip install "sb3-chac[metadrive]".'
+        )
+    import pygame
+
+    if not hasattr(pygame, "Surface"):  # pygame and pygame-ce share a folder: who uninstalls one takes the other's files away
+        raise gym.error.DependencyNotInstalled(
+            "pygame is damaged, as it is after one of pygame and pygame-ce was uninstalled: "
+            "pip install --force-reinstall --no-deps pygame-ce."
         )
 
 
