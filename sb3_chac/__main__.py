@@ -4,8 +4,10 @@ RL-Zoo3's are for places where the stock ``rl_zoo3`` command does not find them 
 """
 
 import sys
+from importlib import import_module
 
-COMMANDS = ("train", "enjoy", "plot_train", "plot_from_file", "all_plots", "evaluate", "resume", "plot")
+OWN_COMMANDS = ("evaluate", "resume", "plot", "demos")  # a module each
+COMMANDS = ("train", "enjoy", "plot_train", "plot_from_file", "all_plots", *OWN_COMMANDS)
 
 USAGE = f"""usage: sb3-chac {{{",".join(COMMANDS)}}} ...
 
@@ -13,6 +15,7 @@ RL-Zoo3's commands with the algorithms of sb3_chac, and
   evaluate MODEL.zip    a model or an expert on held-out scenarios
   resume RUN_FOLDER     go on with a training that was interrupted or killed, from its newest checkpoint
   plot RUN_FOLDER       its curves: return, success rate, safety cost, what the human drove
+  demos COMMAND         demonstrations: record them, look at them, drive them again
 'sb3-chac train --help' lists the arguments, so does --help of the others."""
 
 
@@ -23,20 +26,8 @@ def main() -> None:
         return
     if command not in COMMANDS:
         sys.exit(f"{USAGE}\n\nsb3-chac: {command!r} is not a command, choose from {', '.join(COMMANDS)}.")
-    if command == "evaluate":
-        from sb3_chac.evaluate import main as evaluate
-
-        evaluate(sys.argv[2:])
-        return
-    if command == "resume":
-        from sb3_chac.resume import main as resume
-
-        resume(sys.argv[2:])
-        return
-    if command == "plot":
-        from sb3_chac.plot import main as plot
-
-        plot(sys.argv[2:])
+    if command in OWN_COMMANDS:
+        import_module(f"sb3_chac.{command}").main(sys.argv[2:])
         return
 
     from rl_zoo3.cli import main as zoo_main

@@ -1,13 +1,17 @@
 """RL-Zoo3's own commands with our algorithms, as a user types them. The package under test is the installed one."""
 
+import inspect
 import sys
 import sysconfig
 from pathlib import Path
 
+import gymnasium as gym
+import numpy as np
 import pytest
 import yaml
 from shell import run
 
+from sb3_chac.human.demonstrations import Demonstrations
 from sb3_chac.zoo import hyperparams_file
 from sb3_chac.zoo.registration import ALGORITHMS
 
@@ -34,11 +38,10 @@ def test_train_leaves_what_the_zoo_promises(trained):
     assert dict(saved)["learning_rate"] == 0.001  # ours, not the zoo's default
 
 
-@pytest.mark.parametrize("algo", ["dsac", "pvp", "dpvp", "chac", "sac", "ppo"])
+@pytest.mark.parametrize("algo", ["dsac", "pvp", "dpvp", "chac", "sac", "ppo", "sac_lag", "ppo_lag"])
 def test_our_environment(tmp_path, algo):
-    few = {"ppo": ["-params", "n_steps:64", "batch_size:64"], "chac": ["-params", "switch_after:100", "prefit_steps:5"]}.get(
-        algo, []
-    )
+    few_steps = ["-params", "n_steps:64", "batch_size:64"]
+    few = {"ppo": few_steps, "ppo_lag": few_steps, "chac": ["-params", "switch_after:100", "prefit_steps:5"]}.get(algo, [])
     quick = ["--env", "SafeDrive-v0", "-n", "200", "--eval-freq", "100", "--eval-episodes", "1", "-f", "logs"]
     output = run(ZOO, "train", "--algo", algo, *quick, *few, "--env-kwargs", "horizon:60", "blocks:2", cwd=tmp_path)
     assert str(hyperparams_file(algo)) in output and "Saving to" in output
@@ -224,4 +227,61 @@ def test_every_algorithm_has_hyperparameters_a_sampler_and_a_converter(algo):
         trial = study.ask()
         sampled = zoo.HYPERPARAMS_SAMPLER[algo](trial, 1, 1, {"using_her_replay_buffer": False, "her_kwargs": {}})
         assert zoo.HYPERPARAMS_CONVERTER[algo](trial.params) == sampled
-        zoo.ALGOS[algo]("MlpPolicy", "Pendulum-v1", buffer_size=10, **sampled)
+        needed = {"buffer_size": 10, "dataset": swings()}
+        accepted = inspect.signature(zoo.ALGOS[algo]).parameters
+        given = {name: value for name, value in needed.items() if name in accepted}
+        zoo.ALGOS[algo]("MlpPolicy", "Pendulum-v1", **given, **sampled)
+
+
+def swings():
+    """Two episodes of five steps on Pendulum-v1, as demonstrations."""
+    env = gym.make("Pendulum-v1")
+    observations = np.stack([env.observation_space.sample() for _ in range(10)])
+    is_last = np.arange(10) % 5 == 4
+    return Demonstrations(
+        observation_space=env.observation_space,
+        action_space=env.action_space,
+        observations=observations,
+        actions=np.zeros((10, 1), np.float32),
+        next_observations=observations,
+        rewards=np.zeros(10),
+        terminations=np.zeros(10, bool),
+        truncations=is_last,
+        episodes=np.arange(10) // 5,
+    )
+
+
+def test_demonstrations_are_recorded_and_learned_from(tmp_path):
+    folder = {"MINARI_DATASETS_PATH": str(tmp_path / "datasets")}
+    quick = [
+        "--env",
+        "SafeDrive-v0",
+        "-n",
+        "60",
+        "--eval-freq",
+        "30",
+        "--eval-episodes",
+        "1",
+        "--eval-env-kwargs",
+        "horizon:30",
+    ]
+    output = run(ZOO, "train", "--algo", "bc", *quick, cwd=tmp_path, env=folder, fails=True)
+    assert "sb3_chac demos record" in output
+    command = [
+        "demos",
+        "record",
+        "--expert",
+        "scripted",
+        "--steps",
+        "300",
+        "--dataset",
+        "safedrive/scripted-v0",
+        "--jobs",
+        "1",
+    ]
+    run(sys.executable, "-m", "sb3_chac", *command, cwd=tmp_path, env=folder)
+    for algo in ("bc", "cql"):
+        run(ZOO, "train", "--algo", algo, *quick, cwd=tmp_path, env=folder)
+        model = tmp_path / "logs" / algo / "SafeDrive-v0_1" / "SafeDrive-v0.zip"
+        options = ["--scenarios", "1000", "--env-kwargs", "horizon:30"]
+        assert "safety cost" in run(sys.executable, "-m", "sb3_chac", "evaluate", model, *options, cwd=tmp_path)

@@ -4,7 +4,13 @@ from collections.abc import Callable
 from typing import Any
 
 import optuna
-from rl_zoo3.hyperparams_opt import convert_offpolicy_params, sample_her_params
+from rl_zoo3.hyperparams_opt import (
+    convert_offpolicy_params,
+    convert_onpolicy_params,
+    sample_her_params,
+    sample_ppo_params,
+    sample_sac_params,
+)
 
 
 def sample_dsac_params(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> dict[str, Any]:
@@ -88,12 +94,90 @@ def _suggest_dpvp(trial: optuna.Trial) -> dict[str, Any]:
     }
 
 
+def sample_sac_lag_params(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> dict[str, Any]:
+    """
+    ``cost_limit`` is the task's and not tuned. A study that looks at the return alone finds out how to evade it: read the cost
+    of its trials, too.
+
+    :return: keyword arguments of SACLag. For the parameters see ``sample_dsac_params``
+    """
+    return sample_sac_params(trial, n_actions, n_envs, additional_args) | _suggest_multiplier(trial)
+
+
+def sample_ppo_lag_params(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> dict[str, Any]:
+    """
+    For ``cost_limit`` see ``sample_sac_lag_params``.
+
+    :return: keyword arguments of PPOLag. For the parameters see ``sample_dsac_params``
+    """
+    return sample_ppo_params(trial, n_actions, n_envs, additional_args) | _suggest_multiplier(trial)
+
+
+def _suggest_multiplier(trial: optuna.Trial) -> dict[str, Any]:
+    return {
+        "pid_kp": trial.suggest_float("pid_kp", 0.01, 2.0, log=True),
+        "pid_ki": trial.suggest_float("pid_ki", 1e-3, 0.2, log=True),
+        "pid_kd": trial.suggest_float("pid_kd", 1e-3, 1.0, log=True),
+        "pid_tau": trial.suggest_float("pid_tau", 0.02, 1.0, log=True),
+        "lagrange_init": trial.suggest_float("lagrange_init", 0.0, 5.0),
+    }
+
+
+def sample_bc_params(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> dict[str, Any]:
+    """
+    :return: keyword arguments of BC. For the parameters see ``sample_dsac_params``
+    """
+    params: dict[str, Any] = {
+        "batch_size_pow": trial.suggest_int("batch_size_pow", 6, 10),  # 64 to 1024
+        "learning_rate": trial.suggest_float("learning_rate", 1e-4, 0.003, log=True),
+        "weight_decay": trial.suggest_float("weight_decay", 1e-6, 0.1, log=True),
+        "loss": trial.suggest_categorical("loss", ["mse", "nll"]),
+        "net_arch": trial.suggest_categorical("net_arch", ["small", "medium", "large"]),
+    }
+    trial.set_user_attr("batch_size", 2 ** params["batch_size_pow"])
+    return convert_bc_params(params)
+
+
+def convert_bc_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
+    """
+    :param sampled_params: as Optuna stores them
+    :return: keyword arguments of BC, which has no discount factor
+    """
+    params = convert_offpolicy_params(sampled_params | {"one_minus_gamma": 0.0})
+    del params["gamma"]
+    return params
+
+
+def sample_cql_params(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> dict[str, Any]:
+    """
+    :return: keyword arguments of CQL. For the parameters see ``sample_dsac_params``
+    """
+    params: dict[str, Any] = {
+        "one_minus_gamma": trial.suggest_float("one_minus_gamma", 0.003, 0.1, log=True),
+        "batch_size_pow": trial.suggest_int("batch_size_pow", 6, 8),  # 64 to 256
+        "learning_rate": trial.suggest_float("learning_rate", 3e-5, 0.001, log=True),
+        "actor_lr": trial.suggest_float("actor_lr", 3e-5, 0.001, log=True),
+        "tau": trial.suggest_float("tau", 0.002, 0.02, log=True),
+        "conservative_weight": trial.suggest_float("conservative_weight", 0.3, 10.0, log=True),
+        "net_arch": trial.suggest_categorical("net_arch", ["small", "medium", "large"]),
+    }
+    trial.set_user_attr("gamma", 1 - params["one_minus_gamma"])
+    trial.set_user_attr("batch_size", 2 ** params["batch_size_pow"])
+    return convert_offpolicy_params(params)
+
+
 HYPERPARAMS_SAMPLER: dict[str, Callable[..., dict[str, Any]]] = {
     "dsac": sample_dsac_params,
     "pvp": sample_pvp_params,
     "dpvp": sample_dpvp_params,
     "chac": sample_chac_params,
+    "sac_lag": sample_sac_lag_params,
+    "ppo_lag": sample_ppo_lag_params,
+    "bc": sample_bc_params,
+    "cql": sample_cql_params,
 }
-HYPERPARAMS_CONVERTER: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = dict.fromkeys(
-    HYPERPARAMS_SAMPLER, convert_offpolicy_params
-)
+HYPERPARAMS_CONVERTER: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
+    **dict.fromkeys(HYPERPARAMS_SAMPLER, convert_offpolicy_params),
+    "ppo_lag": convert_onpolicy_params,
+    "bc": convert_bc_params,
+}

@@ -7,7 +7,16 @@ from types import ModuleType
 import sb3_chac
 
 # Names on RL-Zoo3's command line -> public class
-ALGORITHMS = {"dsac": "DSAC", "pvp": "PVP", "dpvp": "DPVP", "chac": "CHAC"}
+ALGORITHMS = {
+    "dsac": "DSAC",
+    "pvp": "PVP",
+    "dpvp": "DPVP",
+    "chac": "CHAC",
+    "sac_lag": "SACLag",
+    "ppo_lag": "PPOLag",
+    "bc": "BC",
+    "cql": "CQL",
+}
 
 
 def hyperparams_file(algo: str) -> Path:

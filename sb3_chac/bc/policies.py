@@ -1,0 +1,132 @@
+from typing import Any, ClassVar
+
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.preprocessing import get_action_dim
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor, NatureCNN, create_mlp
+from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
+from torch import nn
+
+LOG_STD_MIN, LOG_STD_MAX = -5.0, 2.0
+
+
+class BCPolicy(BasePolicy):
+    """
+    A network that imitates: of Box actions it gives the mean, scaled to [-1, 1] and clipped there, and if it is stochastic
+    the logarithm of the standard deviation of a Gaussian; of Discrete ones their logits.
+
+    The mean is not squashed by tanh, as that of SAC is: demonstrations often hold actions at the bounds.
+
+    :param observation_space: Observation space
+    :param action_space: Action space
+    :param lr_schedule: Learning rate schedule
+    :param stochastic: whether to give a standard deviation; without, it acts deterministically. Set by BC's ``loss``
+    :param net_arch: Hidden layers, [256, 256] by default
+    :param activation_fn: Activation function
+    :param features_extractor_class: Features extractor to use, by default the one that fits the observations
+    :param features_extractor_kwargs: Keyword arguments of the features extractor
+    :param normalize_images: Whether to divide images by 255
+    :param optimizer_class: Optimizer
+    :param optimizer_kwargs: Additional keyword arguments of the optimizer, excluding learning rate and weight decay
+    """
+
+    default_features_extractor: ClassVar[type[BaseFeaturesExtractor]] = FlattenExtractor
+    optimizer: th.optim.Optimizer
+
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        action_space: spaces.Box | spaces.Discrete,
+        lr_schedule: Schedule,
+        stochastic: bool = False,
+        net_arch: list[int] | None = None,
+        activation_fn: type[nn.Module] = nn.ReLU,
+        features_extractor_class: type[BaseFeaturesExtractor] | None = None,
+        features_extractor_kwargs: dict[str, Any] | None = None,
+        normalize_images: bool = True,
+        optimizer_class: type[th.optim.Optimizer] = th.optim.AdamW,
+        optimizer_kwargs: dict[str, Any] | None = None,
+    ):
+        super().__init__(
+            observation_space,
+            action_space,
+            features_extractor_class or self.default_features_extractor,
+            features_extractor_kwargs,
+            normalize_images=normalize_images,
+            optimizer_class=optimizer_class,
+            optimizer_kwargs=optimizer_kwargs,
+            squash_output=isinstance(action_space, spaces.Box),  # predict() scales the actions back
+        )
+        self.stochastic = stochastic
+        self.net_arch = [256, 256] if net_arch is None else net_arch
+        self.activation_fn = activation_fn
+        self.features_extractor = self.make_features_extractor()
+        features_dim = self.features_extractor.features_dim
+        self.latent_pi = nn.Sequential(*create_mlp(features_dim, -1, self.net_arch, activation_fn))
+        latent_dim = self.net_arch[-1] if self.net_arch else features_dim
+        if isinstance(action_space, spaces.Discrete):
+            self.logits = nn.Linear(latent_dim, int(action_space.n))
+        else:
+            self.mu = nn.Linear(latent_dim, get_action_dim(action_space))
+            if stochastic:
+                self.log_std = nn.Linear(latent_dim, get_action_dim(action_space))
+        self.optimizer = self.optimizer_class(self.parameters(), lr=lr_schedule(1), **self.optimizer_kwargs)  # type: ignore[call-arg]
+
+    def _latent(self, observations: PyTorchObs) -> th.Tensor:
+        return self.latent_pi(self.extract_features(observations, self.features_extractor))
+
+    def action_logits(self, observations: PyTorchObs) -> th.Tensor:
+        """
+        :return: shape (batch_size, n_actions), for Discrete actions
+        """
+        return self.logits(self._latent(observations))
+
+    def action_mean(self, observations: PyTorchObs) -> th.Tensor:
+        """
+        :return: scaled to [-1, 1], not clipped, shape (batch_size, action_dim), for Box actions
+        """
+        return self.mu(self._latent(observations))
+
+    def action_mean_and_log_std(self, observations: PyTorchObs) -> tuple[th.Tensor, th.Tensor]:
+        """
+        :return: scaled to [-1, 1], not clipped, both of shape (batch_size, action_dim), for Box actions if ``stochastic``
+        """
+        latent = self._latent(observations)
+        return self.mu(latent), self.log_std(latent).clamp(LOG_STD_MIN, LOG_STD_MAX)
+
+    def forward(self, observations: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        return self._predict(observations, deterministic)
+
+    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        if isinstance(self.action_space, spaces.Discrete):
+            logits = self.action_logits(observation)
+            actions = logits.argmax(dim=1) if deterministic else th.distributions.Categorical(logits=logits).sample()
+            return actions + int(self.action_space.start)
+        if not self.stochastic or deterministic:
+            return self.action_mean(observation).clamp(-1.0, 1.0)
+        mean, log_std = self.action_mean_and_log_std(observation)
+        return th.normal(mean, log_std.exp()).clamp(-1.0, 1.0)
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        data = super()._get_constructor_parameters()
+        data.update(
+            lr_schedule=self._dummy_schedule,  # not needed for loading the policy alone
+            stochastic=self.stochastic,
+            net_arch=self.net_arch,
+            activation_fn=self.activation_fn,
+            features_extractor_class=self.features_extractor_class,
+            features_extractor_kwargs=self.features_extractor_kwargs,
+            optimizer_class=self.optimizer_class,
+            optimizer_kwargs=self.optimizer_kwargs,
+        )
+        return data
+
+
+MlpPolicy = BCPolicy
+
+
+class CnnPolicy(BCPolicy):
+    """Policy for image observations: ``BCPolicy`` with the CNN of the DQN Nature paper as features extractor."""
+
+    default_features_extractor = NatureCNN

@@ -1,0 +1,4 @@
+from sb3_chac.cql.cql import CQL
+from sb3_chac.cql.policies import CnnPolicy, MlpPolicy
+
+__all__ = ["CQL", "CnnPolicy", "MlpPolicy"]

@@ -1,0 +1,309 @@
+"""``python -m sb3_chac demos``: record demonstrations, look at them, drive them again."""
+
+import argparse
+import math
+import os
+import signal
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.vec_env import VecNormalize
+
+from sb3_chac.common import pictures
+from sb3_chac.common.episodes import NotEvaluable, Runner, Task, make_env
+from sb3_chac.evaluate import DEFAULT_ENV, check_output, find_algorithm, find_normalization, load_model, parse_env_kwargs
+from sb3_chac.human.dataset_writer import SETTINGS
+from sb3_chac.human.demonstrations import DatasetError, load_demonstrations, open_dataset
+from sb3_chac.human.recording import WatchedEnv, record, saved_model
+
+if TYPE_CHECKING:
+    from minari import MinariDataset
+
+DESCRIPTION = """Demonstrations are datasets in Minari's format, see 'minari list local', in the folder MINARI_DATASETS_PATH,
+~/.minari/datasets if it is not set. A folder may be named in place of an id.
+
+  sb3-chac demos record --expert scripted --steps 50000 --dataset safedrive/scripted-v0
+  sb3-chac demos record --expert scripted --novice sac.zip --dataset safedrive/takeovers-v0
+  sb3-chac demos info --dataset safedrive/scripted-v0
+  sb3-chac demos replay --dataset safedrive/scripted-v0 --episode 3 --video drive.mp4"""
+
+RECORD = """Record whole episodes until there are at least --steps steps. With --novice, that model drives and the expert
+watches it, takes over by --rule and hands back. The dataset does not depend on --jobs; nothing is left of one that is
+interrupted."""
+
+REPLAY = """Make the environment again, reset it with the recorded seed and scenario, and repeat the actions of one episode. It
+tells how far that led elsewhere than when it was recorded."""
+
+
+def make_parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        "sb3-chac demos", description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    commands = parser.add_subparsers(dest="command", required=True, metavar="{record,info,replay}")
+    new = commands.add_parser("record", help="record a dataset", description=RECORD)
+    new.add_argument("--dataset", required=True, metavar="ID", help="such as safedrive/scripted-v0, or a folder")
+    new.add_argument("--overwrite", action="store_true", help="replace a dataset of that name")
+    new.add_argument("--steps", type=int, default=50_000, metavar="N", help="how many at least (default: %(default)s)")
+    who = new.add_argument_group("who acts")
+    who.add_argument(
+        "--expert", required=True, metavar="NAME|MODEL.zip", help="an expert of the environment, e.g. scripted, or a model"
+    )
+    who.add_argument("--novice", type=Path, metavar="MODEL.zip", help="who drives unless the expert takes over")
+    who.add_argument(
+        "--rule",
+        default="risk",
+        choices=("risk", "disagreement", "always", "never"),
+        help="when the expert takes over (%(default)s)",
+    )
+    where = new.add_argument_group("where")
+    where.add_argument("--env", default=DEFAULT_ENV, metavar="ID", help="environment, also module:ID (default: %(default)s)")
+    where.add_argument("--env-kwargs", nargs="+", default=[], metavar="KEY:VALUE", help="passed to it, Python literals")
+    where.add_argument(
+        "--scenarios", metavar="RANGE", help="in turns, e.g. 100:120 (without 120) (default: the environment chooses)"
+    )
+    where.add_argument("--seed", type=int, default=0, help="the episodes' seeds derive from it (default: %(default)s)")
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    where.add_argument(
+        "--jobs", type=int, default=cores, metavar="N", help="number of processes (default: %(default)s, the cores)"
+    )
+
+    info = commands.add_parser("info", help="what is in a dataset", description="Print what is in a dataset.")
+    replay = commands.add_parser("replay", help="drive an episode again", description=REPLAY)
+    for command in (info, replay):
+        command.add_argument("--dataset", required=True, metavar="ID", help="of Minari, or a folder")
+    replay.add_argument("--episode", type=int, default=0, metavar="K", help="number, from 0 (default: %(default)s)")
+    replay.add_argument("--video", type=Path, metavar="FILE", help=".mp4 or .gif of it")
+    return parser
+
+
+def main(arguments: list[str]) -> None:
+    """
+    :param arguments: of the command line, after ``demos``
+    """
+    parser = make_parser()
+    args = parser.parse_args(arguments)
+    th.set_num_threads(1)
+    before = signal.signal(signal.SIGTERM, _stop)  # so that it cleans up as after Ctrl-C
+    try:
+        {"record": run_record, "info": run_info, "replay": run_replay}[args.command](args)
+    except (NotEvaluable, DatasetError, OSError) as error:
+        parser.exit(2, f"{parser.prog} {args.command}: error: {error}\n")
+    except KeyboardInterrupt:
+        parser.exit(130, f"{parser.prog} {args.command}: interrupted\n")
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _stop(signal_number: int, frame: FrameType | None) -> None:
+    sys.exit(128 + signal_number)
+
+
+def run_record(args: argparse.Namespace) -> None:
+    """
+    :param args: see ``make_parser``
+    :raises DatasetError: for a name that is taken, or spaces that a dataset cannot hold
+    :raises FileNotFoundError: if a model does not exist
+    :raises NotEvaluable: for whatever else does not fit
+    """
+    for option, low in [("steps", 1), ("seed", 0), ("jobs", 1)]:
+        if getattr(args, option) < low:
+            raise NotEvaluable(f"--{option} must be at least {low}, got {getattr(args, option)}.")
+    env_kwargs = parse_env_kwargs(args.env_kwargs)
+    env: str | Callable[..., Any] = args.env
+    acting: BaseAlgorithm | str = args.expert
+    expert: BaseAlgorithm | str = args.expert
+    normalize = None
+    if Path(args.expert).suffix == ".zip":
+        expert, normalize = find_model(Path(args.expert), args.env, env_kwargs)
+        acting = expert
+    if args.novice is not None:
+        if normalize is not None:
+            raise NotEvaluable(f"--expert {args.expert} takes over raw observations, but was trained with normalized ones.")
+        env = WatchedEnv(args.env, expert if isinstance(expert, str) else saved_model(expert), args.rule)
+        acting, normalize = find_model(args.novice, args.env, env_kwargs)
+    folder = record(
+        args.dataset,
+        acting,
+        env,
+        args.steps,
+        scenarios=args.scenarios,
+        seed=args.seed,
+        jobs=args.jobs,
+        env_kwargs=env_kwargs,
+        normalize=normalize,
+        overwrite=args.overwrite,
+        progress_bar=True,
+    )
+    print(describe(folder))
+    print(f"Saved {folder}")
+
+
+def find_model(path: Path, env_id: str, env_kwargs: dict[str, Any]) -> tuple[BaseAlgorithm, VecNormalize | None]:
+    """
+    :return: the model, and the statistics that its observations are normalized with, if any
+    """
+    path, algo, algorithm = find_algorithm(path, None)
+    env = make_env(env_id, env_kwargs)
+    model = load_model(path, algo, algorithm, env)
+    env.close()
+    return model, find_normalization(path, env_id)[1]
+
+
+def run_info(args: argparse.Namespace) -> None:
+    """
+    :raises DatasetError: for a dataset that is missing, damaged or empty
+    """
+    print(describe(args.dataset))
+
+
+def describe(dataset: str | os.PathLike[str]) -> str:
+    """
+    :return: what there is to know about a dataset, to read
+    :raises DatasetError: for one that is missing, damaged or empty
+    """
+    demonstrations, opened = load_demonstrations(dataset), open_dataset(dataset)
+    metadata = opened.storage.metadata
+    settings = metadata.get(SETTINGS, {})
+    episodes, spec = demonstrations.episodes, opened.env_spec
+    size = sum(file.stat().st_size for file in opened.storage.data_path.rglob("*") if file.is_file())
+    lines = [f"{opened.id}: {opened.total_episodes} episodes, {len(demonstrations)} steps, {size / 1e6:.1f} MB"]
+
+    def add(title: str, text: str) -> None:
+        lines.append(f"  {title:<18}{text}")
+
+    def add_statistics(title: str, values: np.ndarray) -> None:
+        add(title, f"{values.mean():.3f} ± {values.std():.3f}")
+
+    add_statistics("return", np.bincount(episodes, demonstrations.rewards))
+    if demonstrations.costs is not None:
+        add_statistics("safety cost", np.bincount(episodes, demonstrations.costs))
+    if demonstrations.successes is not None:
+        last = np.flatnonzero(np.diff(episodes, append=-1))
+        add("success rate", f"{demonstrations.successes[last].mean():.3f}")
+    if demonstrations.takeovers is not None:
+        add("takeover share", f"{demonstrations.takeovers.mean():.3f}")
+    add("observations", shortened(demonstrations.observation_space))
+    add("actions", shortened(demonstrations.action_space))
+    add("environment", f"{spec.id} {spec.kwargs or ''}".rstrip() if spec else "not known")
+    add("policy", metadata.get("algorithm_name", "not known"))
+    if settings:
+        add("recorded with", f"seed {settings['seed']}, scenarios {as_range(settings['scenarios'])}")
+    versions = {"minari": opened.minari_version, **settings.get("versions", {})}
+    add("versions", ", ".join(f"{name} {version}" for name, version in versions.items()))
+    return "\n".join(lines)
+
+
+def as_range(scenarios: list[int] | None) -> str:
+    """
+    :return: "100:120" for 100 to 119 in their order, else the numbers themselves
+    """
+    if scenarios is None:
+        return "of the environment"
+    first, end = scenarios[0], scenarios[-1] + 1
+    return f"{first}:{end}" if scenarios == list(range(first, end)) else ", ".join(map(str, scenarios))
+
+
+def shortened(space: spaces.Space) -> str:
+    """
+    :return: what to call it, without a number for each of its bounds
+    """
+    if not isinstance(space, spaces.Box):
+        return str(space)
+    return f"Box({space.low.min():g}, {space.high.max():g}, {space.shape}, {space.dtype})"
+
+
+def run_replay(args: argparse.Namespace) -> None:
+    """
+    :raises DatasetError: for a dataset, or an episode of it, that is missing or cannot be driven again
+    :raises NotEvaluable: if its environment cannot be made, or cannot render
+    """
+    check_output("--video", args.video, pictures.VIDEO_SUFFIXES)
+    dataset = open_dataset(args.dataset)
+    with Replay(dataset, args.episode, "rgb_array" if args.video else None) as replay:
+        if args.video:
+            pictures.check_can_render(replay)
+            try:
+                pictures.save_video(args.video, replay, args.episode)
+            except BaseException:
+                args.video.unlink(missing_ok=True)
+                raise
+        else:
+            replay.episode(args.episode)
+    print(replay.report())
+    if args.video:
+        print(f"Saved {args.video}")
+
+
+class Replay(Runner):
+    """
+    Repeats the actions of an episode. A context manager, which closes its environment.
+
+    :param dataset: holds the episode
+    :param number: of the episode
+    :param render_mode: of the environment
+    :raises DatasetError: if there is no such episode, or neither its environment nor its seed is known
+    :raises NotEvaluable: if the environment cannot be made
+    """
+
+    def __init__(self, dataset: "MinariDataset", number: int, render_mode: str | None = None) -> None:
+        if not 0 <= number < dataset.total_episodes:
+            raise DatasetError(f"{dataset.id}: there is no episode {number}, they are 0 to {dataset.total_episodes - 1}.")
+        spec = dataset.env_spec
+        if spec is None:
+            raise DatasetError(f"{dataset.id} does not say how its environment is made: it cannot be driven again.")
+        (self.metadata,) = dataset.storage.get_episode_metadata([number])
+        if self.metadata.get("seed") is None:
+            raise DatasetError(f"{dataset.id} does not hold the seed of episode {number}: it cannot be driven again.")
+        self.recorded = dataset[number]
+        self.observations: list[np.ndarray] = []
+        self.rewards: list[float] = []
+        super().__init__(Task(lambda observation: None, spec, {}), render_mode)
+
+    def __enter__(self) -> "Replay":
+        return self
+
+    def episode(self, number: int, on_step: Callable[[], None] = lambda: None) -> tuple[dict[str, Any], None]:
+        """
+        :param number: of the episode
+        :param on_step: called after the reset and after each step
+        :return: number, return and steps; see ``report`` for how they differ from those recorded
+        """
+        observation, _ = self.env.reset(seed=self.metadata["seed"], options=self.metadata.get("options"))
+        self.observations, self.rewards = [observation], []
+        on_step()
+        is_discrete = isinstance(self.env.action_space, spaces.Discrete)
+        for action in self.recorded.actions:
+            observation, reward, terminated, truncated, _ = self.env.step(int(action) if is_discrete else action)
+            self.observations.append(observation)
+            self.rewards.append(float(reward))
+            on_step()
+            if terminated or truncated:
+                break
+        return {"episode": number, "return": math.fsum(self.rewards), "steps": len(self.rewards)}, None
+
+    def report(self) -> str:
+        """
+        :return: how what happened differs from what was recorded, to read
+        """
+        steps, recorded_steps = len(self.rewards), len(self.recorded.rewards)
+        total, recorded_total = math.fsum(self.rewards), math.fsum(self.recorded.rewards)
+        gaps = [
+            float(np.max(np.abs(np.asarray(now, float) - then), initial=0.0))
+            for now, then in zip(self.observations, self.recorded.observations, strict=False)
+        ]
+        differing = np.flatnonzero(gaps)
+        lines = [
+            f"episode {self.recorded.id}: recorded {recorded_steps} steps, return {recorded_total:.6g}; "
+            f"replayed {steps} steps, return {total:.6g}",
+            f"  the returns differ by {abs(total - recorded_total):.3g}, the observations by {max(gaps):.3g} at most",
+        ]
+        if len(differing):
+            lines.append(f"  the first difference is after step {differing[0]}")
+        return "\n".join(lines)

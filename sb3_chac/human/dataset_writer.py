@@ -1,0 +1,152 @@
+"""Writes datasets in Minari's format: complete ones or none."""
+
+import importlib.metadata
+import os
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import gymnasium as gym
+from gymnasium.envs.registration import EnvSpec
+
+import sb3_chac
+from sb3_chac.human.demonstrations import DatasetError, is_dataset_id, minari_folder
+from sb3_chac.human.intervention import InterventionWrapper
+
+if TYPE_CHECKING:
+    from minari.data_collector import EpisodeBuffer
+
+SETTINGS = "sb3_chac"  # where Minari's metadata holds ours
+
+
+class DatasetWriter:
+    """
+    Writes a dataset into a hidden folder beside its own and gives it its name at the end: what is interrupted leaves nothing.
+
+    :param folder: of the dataset, see ``folder_to_make``
+    :param env: the environment that is recorded
+    :param settings: how it was recorded, can be written as JSON
+    :param overwrite: whether ``folder`` may be there
+    """
+
+    def __init__(self, folder: Path, env: gym.Env, settings: dict[str, Any], overwrite: bool) -> None:
+        self.folder, self.overwrite = folder, overwrite
+        self.env, self.settings = env, settings
+        self.steps = 0
+
+    def __enter__(self) -> "DatasetWriter":
+        from minari.dataset.minari_storage import MinariStorage
+
+        root = next(parent for parent in self.folder.parents if parent.is_dir())
+        try:
+            self.temporary = tempfile.TemporaryDirectory(prefix=".recording-", dir=root)
+        except OSError as error:
+            raise DatasetError(f"dataset: {root} cannot be written ({error.strerror}).") from error
+        data = Path(self.temporary.name, "new", "data")
+        data.mkdir(parents=True)
+        self.storage = MinariStorage.new(
+            data,
+            observation_space=self.env.observation_space,
+            action_space=self.env.action_space,
+            env_spec=storable_spec(self.env),
+            data_format="hdf5",
+            jpeg_encoding=False,  # it loses what the picture was
+        )
+        return self
+
+    def add(self, episode: "EpisodeBuffer") -> None:
+        self.storage.update_episodes([episode])
+        self.steps += len(episode)
+
+    def finish(self) -> None:
+        """
+        :raises DatasetError: if a dataset of that name has come into being in the meantime
+        """
+        dataset_id = dataset_id_of(self.folder)
+        self.storage.update_metadata(
+            {
+                "dataset_id": dataset_id,
+                "minari_version": importlib.metadata.version("minari"),
+                "algorithm_name": self.settings["policy"],
+                "description": f"Recorded by sb3_chac: {self.settings['policy']}",
+                SETTINGS: {**self.settings, "versions": versions()},
+            }
+        )
+        make_namespace(dataset_id)
+        self.folder.parent.mkdir(parents=True, exist_ok=True)
+        check_free(self.folder, self.overwrite)
+        if self.folder.exists():
+            self.folder.rename(Path(self.temporary.name, "old"))
+        Path(self.temporary.name, "new").rename(self.folder)
+
+    def __exit__(self, *_: object) -> None:
+        self.temporary.cleanup()
+
+
+def folder_to_make(dataset: str | os.PathLike[str], overwrite: bool) -> Path:
+    """
+    :param dataset: id for Minari's folder, or the folder to make: an absolute one, or one that begins with "."
+    :return: the folder of the dataset
+    :raises DatasetError: for a name that Minari does not take, or one that is taken
+    """
+    name = os.fspath(dataset)
+    is_folder = not isinstance(dataset, str) or name.startswith(".") or os.path.isabs(name)
+    folder = Path(name).absolute() if is_folder else minari_folder().absolute() / name
+    if not is_dataset_id(dataset_id_of(folder)):
+        raise DatasetError(f"dataset: the name must look like safedrive/scripted-v0, with a version at its end, got {name!r}.")
+    check_free(folder, overwrite)
+    return folder
+
+
+def check_free(folder: Path, overwrite: bool) -> None:
+    """
+    :raises DatasetError: if the folder is there, unless it is a dataset that may be overwritten
+    """
+    if not folder.exists():
+        return
+    if not (folder / "data").is_dir():
+        raise DatasetError(f"dataset: {folder} is there and is not a dataset. Choose another name.")
+    if not overwrite:
+        raise DatasetError(f"dataset: {folder} exists already. Choose another name, or replace it with --overwrite.")
+
+
+def dataset_id_of(folder: Path) -> str:
+    """
+    :return: the id under which Minari finds the dataset, or the name of its folder if it is kept elsewhere
+    """
+    root = minari_folder().absolute()
+    return folder.relative_to(root).as_posix() if folder.is_relative_to(root) else folder.name
+
+
+def make_namespace(dataset_id: str) -> None:
+    """Minari lists datasets in folders that it knows as namespaces only."""
+    from minari.namespace import create_namespace, list_local_namespaces
+
+    namespace = dataset_id.rpartition("/")[0]
+    if namespace and namespace not in list_local_namespaces():
+        create_namespace(namespace)
+
+
+def storable_spec(env: gym.Env) -> EnvSpec | None:
+    """
+    :return: how to make the environment again, without those who take over; None if that cannot be written down
+    """
+    spec = env.spec
+    if spec is None:
+        return None
+    wrappers = tuple(wrapper for wrapper in spec.additional_wrappers if wrapper.name != InterventionWrapper.__name__)
+    spec = replace(spec, additional_wrappers=wrappers)
+    try:
+        spec.to_json()
+    except (TypeError, ValueError):  # e.g. a class as entry point
+        return None
+    return spec
+
+
+def versions() -> dict[str, str]:
+    """
+    :return: of the packages that have a say in what is recorded
+    """
+    names = ("stable_baselines3", "gymnasium", "numpy", "minari")
+    return {"sb3_chac": sb3_chac.__version__, **{name: importlib.metadata.version(name) for name in names}}

@@ -1,0 +1,298 @@
+"""Demonstrations: datasets in Minari's format (minari.farama.org) as flat arrays. ``human.recording`` makes such datasets."""
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from gymnasium import spaces
+from stable_baselines3.common.preprocessing import is_image_space
+from stable_baselines3.common.vec_env import VecTransposeImage
+
+if TYPE_CHECKING:
+    from minari import MinariDataset
+
+HOW_TO_GET_ONE = (
+    "Record one with 'python -m sb3_chac demos record', fetch one with 'minari download', or list those that are there with "
+    "'minari list local'."
+)
+# Names in the infos of a recording -> fields of Demonstrations. An action's info is stored at the index of what follows it
+INFOS = {"takeover": "takeovers", "novice_action": "novice_actions", "cost": "costs", "is_success": "successes"}
+
+
+class DatasetError(ValueError):
+    """Raised for a dataset that is missing, damaged, empty or made for other spaces; says what is wrong and what to do."""
+
+
+@dataclass(frozen=True, eq=False)
+class Demonstrations:
+    """
+    What somebody did in an environment, step after step: n steps of all episodes, in their order. The dtypes are those of the
+    recording.
+
+    :param observation_space: of the observations, a Box
+    :param action_space: of the actions, a Box or Discrete
+    :param observations: what the actions answered, shape (n, *observation_shape)
+    :param actions: what was executed, in the units of the action space, shape (n, *action_shape)
+    :param next_observations: what followed, shape (n, *observation_shape)
+    :param rewards: shape (n,)
+    :param terminations: whether the episode ended there for good, shape (n,), bool
+    :param truncations: whether it was cut off there, e.g. by a time limit, shape (n,), bool
+    :param episodes: index of the episode that a step belongs to, shape (n,), int
+    :param takeovers: whether the human (or the expert in the human's place) drove, shape (n,), bool; None if not recorded
+    :param novice_actions: what the novice proposed, shape (n, *action_shape); None if there was no novice
+    :param costs: safety costs, shape (n,); None if not recorded
+    :param successes: whether the goal was reached by then, shape (n,), bool; None if not recorded
+    """
+
+    observation_space: spaces.Space
+    action_space: spaces.Space
+    observations: np.ndarray
+    actions: np.ndarray
+    next_observations: np.ndarray
+    rewards: np.ndarray
+    terminations: np.ndarray
+    truncations: np.ndarray
+    episodes: np.ndarray
+    takeovers: np.ndarray | None = None
+    novice_actions: np.ndarray | None = None
+    costs: np.ndarray | None = None
+    successes: np.ndarray | None = None
+
+    def __len__(self) -> int:
+        return len(self.rewards)
+
+
+def load_demonstrations(
+    dataset: str | os.PathLike[str] | Demonstrations,
+    observation_space: spaces.Space | None = None,
+    action_space: spaces.Space | None = None,
+) -> Demonstrations:
+    """
+    :param dataset: id of a dataset among the local ones of Minari ("safedrive/scripted-v0"), its folder, or what was loaded
+        before. It may have been recorded by others, with ``minari.DataCollector``
+    :param observation_space: what it must fit (images are transposed if need be), anything if None
+    :param action_space: what it must fit, anything if None
+    :return: all its episodes
+    :raises DatasetError: if it is missing, damaged, empty or does not fit
+    """
+    if isinstance(dataset, Demonstrations):
+        demonstrations, name = dataset, "the demonstrations"
+    elif isinstance(dataset, str | os.PathLike):
+        name = f"dataset {os.fspath(dataset)!r}"
+        opened = open_dataset(dataset)
+        check_spaces(opened.observation_space, opened.action_space)
+        try:
+            demonstrations = _read(opened)
+        except Exception as error:  # h5py raises nearly anything, numpy for shapes that do not fit together
+            raise _damaged(name, error) from error
+    else:
+        raise DatasetError(f"dataset: must be the id or folder of a dataset, or Demonstrations, got {dataset!r}.")
+    _check_arrays(demonstrations, name)
+    for kind, expected in [("observation", observation_space), ("action", action_space)]:
+        if expected is None:
+            continue
+        found = getattr(demonstrations, f"{kind}_space")
+        if kind == "observation" and found != expected and is_image_space(found) and len(found.shape) == 3:
+            demonstrations = _channels_first(demonstrations)
+            found = demonstrations.observation_space
+        difference = space_difference(found, expected)
+        if difference:
+            raise DatasetError(
+                f"{name} does not fit the environment: the {kind} space differs in {difference}. Use the environment (with "
+                "the wrappers and env_kwargs) that it was recorded in, or record another ('python -m sb3_chac demos record')."
+            )
+    return demonstrations
+
+
+def open_dataset(dataset: str | os.PathLike[str]) -> "MinariDataset":
+    """
+    :param dataset: id of a local dataset of Minari, or its folder
+    :raises DatasetError: if it is missing, damaged or empty
+    """
+    from minari import MinariDataset
+
+    folder = find_dataset(dataset)
+    try:
+        opened = MinariDataset(folder)
+        empty = opened.total_episodes == 0 or opened.total_steps == 0
+    except Exception as error:  # whatever a damaged file, or one of another version, leads to
+        raise _damaged(f"dataset {os.fspath(dataset)!r}", error) from error
+    if empty:
+        raise DatasetError(f"dataset {os.fspath(dataset)!r} holds no steps. {HOW_TO_GET_ONE}")
+    return opened
+
+
+def find_dataset(dataset: str | os.PathLike[str]) -> Path:
+    """
+    :param dataset: id of a local dataset of Minari, or its folder
+    :return: the folder that holds the data
+    :raises DatasetError: if there is none
+    """
+    name = os.fspath(dataset)
+    candidates = [Path(name)]
+    if is_dataset_id(name):
+        candidates.insert(0, minari_folder() / name)
+    for candidate in candidates:
+        if (candidate / "data").is_dir():
+            return candidate / "data"
+        if (candidate / "metadata.json").is_file():
+            return candidate
+    looked_for = " or ".join(str(candidate) for candidate in candidates)
+    raise DatasetError(f"There is no dataset {name!r} (looked for {looked_for}). {HOW_TO_GET_ONE}")
+
+
+def minari_folder() -> Path:
+    """
+    :return: where Minari keeps its datasets. It need not exist yet
+    """
+    return Path(os.environ.get("MINARI_DATASETS_PATH") or Path.home() / ".minari" / "datasets")
+
+
+def is_dataset_id(name: str) -> bool:
+    """
+    :return: whether it is an id such as "safedrive/scripted-v0", with a version at its end
+    """
+    from minari.dataset.minari_dataset import parse_dataset_id
+
+    try:
+        parse_dataset_id(name)
+    except (ValueError, TypeError):  # malformed, without a version
+        return False
+    return True
+
+
+def check_spaces(observation_space: spaces.Space, action_space: spaces.Space) -> None:
+    """
+    :raises DatasetError: unless observations are a Box and actions a Box or Discrete
+    """
+    if not isinstance(observation_space, spaces.Box):
+        raise DatasetError(
+            f"Demonstrations need Box observations, got {observation_space}. Wrap the environment, e.g. in "
+            "gymnasium.wrappers.FlattenObservation, before you record and learn."
+        )
+    if not isinstance(action_space, spaces.Box | spaces.Discrete):
+        raise DatasetError(f"Demonstrations need Box or Discrete actions, got {action_space}. Wrap the environment.")
+
+
+def space_difference(found: spaces.Space, expected: spaces.Space) -> str:
+    """
+    :return: what differs in ``found``, to follow "differs in", or "" if nothing does
+    """
+    if not (isinstance(found, spaces.Box) and isinstance(expected, spaces.Box)):
+        return "" if found == expected else f"its kind: {found} instead of {expected}"
+    if found.shape != expected.shape:
+        return f"shape: {found.shape} instead of {expected.shape}"
+    differences = []
+    if found.dtype != expected.dtype:
+        differences.append(f"dtype: {found.dtype} instead of {expected.dtype}")
+    for bound in ("low", "high"):
+        ours, theirs = getattr(found, bound), getattr(expected, bound)
+        differing = np.argwhere(~np.isclose(ours, theirs))
+        if len(differing):
+            index = tuple(differing[0])
+            where = ", ".join(str(int(number)) for number in index)
+            differences.append(f"bounds: {bound}[{where}] is {ours[index]:g} instead of {theirs[index]:g}")
+    return "; ".join(differences)
+
+
+def _read(dataset: "MinariDataset") -> Demonstrations:
+    """
+    :raises Exception: of any kind, for a damaged one
+    """
+    episodes = list(dataset.storage.get_episodes(dataset.episode_indices))
+    lengths = [len(episode["rewards"]) for episode in episodes]
+    for number, (episode, length) in enumerate(zip(episodes, lengths, strict=True)):
+        counts = [len(episode[key]) for key in ("observations", "actions", "terminations", "truncations")]
+        if counts != [length + 1, length, length, length]:
+            raise ValueError(
+                f"episode {number} has {length} rewards, but {counts[0]} observations, {counts[1]} actions, {counts[2]} "
+                f"terminations and {counts[3]} truncations"
+            )
+    observations = [np.asarray(episode["observations"]) for episode in episodes]
+
+    def joined(key: str) -> np.ndarray:
+        return np.concatenate([np.asarray(episode[key]) for episode in episodes])
+
+    return Demonstrations(
+        dataset.observation_space,
+        dataset.action_space,
+        observations=np.concatenate([values[:-1] for values in observations]),
+        actions=joined("actions"),
+        next_observations=np.concatenate([values[1:] for values in observations]),
+        rewards=joined("rewards"),
+        terminations=joined("terminations").astype(bool),
+        truncations=joined("truncations").astype(bool),
+        episodes=np.repeat(np.arange(len(episodes)), lengths),
+        **{field: _joined_infos(episodes, lengths, key) for key, field in INFOS.items()},
+    )
+
+
+def _joined_infos(episodes: Sequence[dict[str, Any]], lengths: Sequence[int], key: str) -> np.ndarray | None:
+    """
+    :return: the values that belong to the actions, None unless every episode has one for each
+    """
+    infos = [np.asarray((episode["infos"] or {}).get(key)) for episode in episodes]
+    if any(values.shape[:1] != (length + 1,) for values, length in zip(infos, lengths, strict=True)):
+        return None
+    return np.concatenate([values[1:] for values in infos])
+
+
+def _check_arrays(demonstrations: Demonstrations, name: str) -> None:
+    """
+    :raises DatasetError: unless there is at least one step, all arrays have the shape that their space asks for, all numbers
+        are finite and all actions within their bounds
+    """
+    observation_space, action_space = demonstrations.observation_space, demonstrations.action_space
+    check_spaces(observation_space, action_space)
+    steps = len(demonstrations)
+    if steps == 0:
+        raise DatasetError(f"{name} holds no steps. {HOW_TO_GET_ONE}")
+    observation_shape, action_shape = (steps, *observation_space.shape), (steps, *action_space.shape)  # type: ignore[misc]
+    shapes = {
+        **dict.fromkeys(("observations", "next_observations"), observation_shape),
+        **dict.fromkeys(("actions", "novice_actions"), action_shape),
+        **dict.fromkeys(("rewards", "terminations", "truncations", "episodes", "takeovers", "costs", "successes"), (steps,)),
+    }
+    for field, shape in shapes.items():
+        values = getattr(demonstrations, field)
+        if values is None:
+            continue
+        if values.shape != shape:
+            raise _damaged(name, f"{field} have shape {values.shape} instead of {shape}")
+        finite = np.isfinite(values).reshape(steps, -1).all(axis=1)
+        if not finite.all():
+            raise _damaged(name, f"{field} are NaN or infinite at step {int(np.argmin(finite))}")
+    if isinstance(action_space, spaces.Discrete):
+        low, high = np.array(action_space.start), np.array(action_space.start + action_space.n - 1)
+    else:
+        assert isinstance(action_space, spaces.Box)
+        low, high = action_space.low.astype(float), action_space.high.astype(float)
+    tolerance = np.nan_to_num(1e-6 * (high - low), posinf=0.0)  # for rounding
+    outside = ((demonstrations.actions < low - tolerance) | (demonstrations.actions > high + tolerance)).reshape(steps, -1)
+    if outside.any():
+        step = int(np.argmax(outside.any(axis=1)))
+        raise DatasetError(
+            f"{name}: the action of step {step} is out of bounds, {demonstrations.actions[step]} is not in {action_space}. "
+            "Record what the environment executes: clip the actions before they are recorded."
+        )
+
+
+def _channels_first(demonstrations: Demonstrations) -> Demonstrations:
+    """As SB3's models see images: it transposes those of environments itself."""
+    assert isinstance(demonstrations.observation_space, spaces.Box)
+    return replace(
+        demonstrations,
+        observation_space=VecTransposeImage.transpose_space(demonstrations.observation_space),
+        observations=np.moveaxis(demonstrations.observations, -1, 1),
+        next_observations=np.moveaxis(demonstrations.next_observations, -1, 1),
+    )
+
+
+def _damaged(name: str, problem: object) -> DatasetError:
+    return DatasetError(
+        f"{name}: the dataset cannot be used, it is damaged or not Minari's: {str(problem) or type(problem).__name__}. "
+        "Restore it from a copy, or record it anew with 'python -m sb3_chac demos record --overwrite'."
+    )

@@ -1,0 +1,4 @@
+from sb3_chac.ppo_lag.policies import CnnPolicy, MlpPolicy, MultiInputPolicy
+from sb3_chac.ppo_lag.ppo_lag import PPOLag
+
+__all__ = ["CnnPolicy", "MlpPolicy", "MultiInputPolicy", "PPOLag"]

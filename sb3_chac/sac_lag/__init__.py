@@ -1,0 +1,4 @@
+from sb3_chac.sac_lag.policies import CnnPolicy, MlpPolicy, MultiInputPolicy
+from sb3_chac.sac_lag.sac_lag import SACLag
+
+__all__ = ["CnnPolicy", "MlpPolicy", "MultiInputPolicy", "SACLag"]
