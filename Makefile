@@ -50,6 +50,7 @@ bench: $(INSTALLED)
 	$(BIN)/python benchmarks/guidance.py report
 	$(BIN)/python benchmarks/guidance.py agents
 	$(BIN)/python benchmarks/guidance.py cost
+	$(BIN)/python benchmarks/metadrive_safety.py drivers
 
 $(INSTALLED): setup.cfg pyproject.toml constraints.txt build_hooks.py sb3_chac.pth sb3_chac.start
 	python3 -m venv $(VENV)

@@ -269,7 +269,12 @@ def test_second_environment_is_refused_until_the_first_is_closed_or_lost():
 @needs_metadrive
 def test_training_and_evaluation_in_processes_of_their_own():
     training = make_vec_env(
-        "MetaDriveSafety-v0", n_envs=2, seed=0, wrapper_class=InterventionWrapper, vec_env_cls=SubprocVecEnv
+        "MetaDriveSafety-v0",
+        n_envs=2,
+        seed=0,
+        env_kwargs={"headless": True},  # the server that forks them may be older than the environment variable
+        wrapper_class=InterventionWrapper,
+        vec_env_cls=SubprocVecEnv,
     )
     try:
         model = DPVP("MlpPolicy", training, learning_starts=50, batch_size=16, seed=0)
