@@ -18,10 +18,11 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_chac.common import pictures
 from sb3_chac.common.episodes import NotEvaluable, Runner, Task, make_env
+from sb3_chac.common.evaluation import saved_model
 from sb3_chac.evaluate import DEFAULT_ENV, check_output, find_algorithm, find_normalization, load_model, parse_env_kwargs
 from sb3_chac.human.dataset_writer import SETTINGS
 from sb3_chac.human.demonstrations import DatasetError, load_demonstrations, open_dataset
-from sb3_chac.human.recording import WatchedEnv, record, saved_model
+from sb3_chac.human.recording import WatchedEnv, record
 
 if TYPE_CHECKING:
     from minari import MinariDataset
@@ -294,7 +295,7 @@ class Replay(Runner):
         """
         steps, recorded_steps = len(self.rewards), len(self.recorded.rewards)
         total, recorded_total = math.fsum(self.rewards), math.fsum(self.recorded.rewards)
-        gaps = [
+        gaps = [  # as far as both go
             float(np.max(np.abs(np.asarray(now, float) - then), initial=0.0))
             for now, then in zip(self.observations, self.recorded.observations, strict=False)
         ]

@@ -214,13 +214,19 @@ def _episodes(runner: Runner, numbers: list[int], jobs: int) -> Iterator[tuple[d
     if isinstance(task.env, str) and runner.env.spec is not None:
         task = task._replace(env=runner.env.spec)  # the processes need not know the id
     if isinstance(task.policy, BaseAlgorithm):
-        archive = io.BytesIO()
-        task.policy.save(archive)
-        control = task.policy.policy.control if isinstance(task.policy, CHAC) else None
-        task = task._replace(policy=SavedModel(type(task.policy), archive.getvalue(), control))
+        task = task._replace(policy=saved_model(task.policy))
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(min(jobs, len(numbers)), context, _start_process, (CloudpickleWrapper(task),)) as pool:
         yield from pool.map(_run_episode, numbers)
+
+
+def saved_model(model: BaseAlgorithm) -> SavedModel:
+    """
+    :return: the model in a form that can be sent to another process
+    """
+    archive = io.BytesIO()
+    model.save(archive)
+    return SavedModel(type(model), archive.getvalue(), model.policy.control if isinstance(model, CHAC) else None)
 
 
 _runner: Runner  # of a worker process

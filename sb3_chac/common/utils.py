@@ -7,6 +7,8 @@ import torch as th
 from stable_baselines3.common.utils import get_parameters_by_name
 from torch import nn
 
+from sb3_chac.common.checks import check_range
+
 
 @th.no_grad()
 def polyak_update(params: Iterable[th.Tensor], target_params: Iterable[th.Tensor], tau: float) -> None:
@@ -64,3 +66,22 @@ def frozen(params: Iterable[th.Tensor]) -> Iterator[None]:
     finally:
         for param in params:
             param.requires_grad_(True)
+
+
+def initial_ent_coef(ent_coef: str | float) -> float:
+    """
+    :param ent_coef: the argument of an algorithm
+    :return: alpha at the start: 1 for 'auto', x for 'auto_x' and for the number x
+    :raises ValueError: for anything else
+    """
+    if not isinstance(ent_coef, str):
+        check_range("ent_coef", ent_coef, low=0.0)
+        return float(ent_coef)
+    kind, _, value = ent_coef.partition("_")
+    try:
+        initial = float(value) if value else 1.0
+    except ValueError:
+        initial = -1.0
+    if kind != "auto" or initial <= 0:
+        raise ValueError(f"ent_coef must be 'auto', 'auto_0.1' (0.1 to start with) or a number, got {ent_coef!r}.")
+    return initial

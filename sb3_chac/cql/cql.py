@@ -12,7 +12,7 @@ from stable_baselines3.sac.policies import Actor
 
 from sb3_chac.common.checks import check_action_space, check_integer, check_learning_rate, check_range
 from sb3_chac.common.offline import Batch, OfflineAlgorithm
-from sb3_chac.common.utils import TargetUpdate, frozen, minimize
+from sb3_chac.common.utils import TargetUpdate, frozen, initial_ent_coef, minimize
 from sb3_chac.cql.policies import CnnPolicy, CQLPolicy, MlpPolicy
 from sb3_chac.human.demonstrations import Demonstrations
 
@@ -152,7 +152,7 @@ class CQL(OfflineAlgorithm):
 
         learn_ent_coef, learn_weight = isinstance(self.ent_coef, str), self.lagrange_threshold is not None
         with th.no_grad():
-            self.policy.log_ent_coef.fill_(self._initial_ent_coef()).log_()
+            self.policy.log_ent_coef.fill_(initial_ent_coef(self.ent_coef)).log_()
             self.policy.log_conservative_weight.fill_(self.conservative_weight).log_()
         self.policy.log_ent_coef.requires_grad_(learn_ent_coef)
         self.policy.log_conservative_weight.requires_grad_(learn_weight)
@@ -160,22 +160,6 @@ class CQL(OfflineAlgorithm):
             self.ent_coef_optimizer = th.optim.Adam([self.policy.log_ent_coef], lr=self.actor_lr_schedule(1.0))
         if learn_weight:
             self.lagrange_optimizer = th.optim.Adam([self.policy.log_conservative_weight], lr=self.lagrange_lr)
-
-    def _initial_ent_coef(self) -> float:
-        """
-        :return: alpha at the start: 1 for 'auto', x for 'auto_x' and for the number x
-        """
-        if not isinstance(self.ent_coef, str):
-            check_range("ent_coef", self.ent_coef, low=0.0)
-            return float(self.ent_coef)
-        kind, _, value = self.ent_coef.partition("_")
-        try:
-            initial = float(value) if value else 1.0
-        except ValueError:
-            initial = -1.0
-        if kind != "auto" or initial <= 0:
-            raise ValueError(f"ent_coef must be 'auto', 'auto_0.1' (0.1 to start with) or a number, got {self.ent_coef!r}.")
-        return initial
 
     def _check_arguments(self) -> None:
         super()._check_arguments()
@@ -192,7 +176,7 @@ class CQL(OfflineAlgorithm):
             check_range("lagrange_threshold", self.lagrange_threshold, low=0.0, exclusive_low=True)
         if self.target_entropy != "auto":
             check_range("target_entropy", self.target_entropy)
-        self._initial_ent_coef()
+        initial_ent_coef(self.ent_coef)
 
     def _optimizers(self) -> list[th.optim.Optimizer]:
         return [self.critic.optimizer]

@@ -13,7 +13,7 @@ from sb3_chac.common.buffers import DualReplayBuffer, DualReplayBufferSamples, t
 from sb3_chac.common.checks import check_range
 from sb3_chac.common.distributional import gaussian_surrogate_loss
 from sb3_chac.common.guided import GuidedOffPolicyAlgorithm
-from sb3_chac.common.utils import TargetUpdate, minimize
+from sb3_chac.common.utils import TargetUpdate, initial_ent_coef, minimize
 from sb3_chac.dpvp.policies import CnnPolicy, DPVPPolicy, MlpPolicy, MultiInputPolicy
 from sb3_chac.dsac.dsac import DSAC
 
@@ -237,7 +237,7 @@ class DPVP(GuidedOffPolicyAlgorithm, DSAC):
         check_range("average_tau", self.average_tau, low=0.0, high=1.0)
         if self.eta_pv is not None:
             check_range("eta_pv", self.eta_pv, low=0.0, exclusive_low=True)
-        if self.preset != "paper" and self._initial_ent_coef() > 0.1 * self.proxy_value:
+        if self.preset != "paper" and initial_ent_coef(self.ent_coef) > 0.1 * self.proxy_value:
             warnings.warn(
                 f"ent_coef={self.ent_coef!r}: the entropy bonus will swamp the takeovers' labels of +-{self.proxy_value:g}. "
                 "Use a fixed coefficient of about 0.01 times proxy_value."

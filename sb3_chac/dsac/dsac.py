@@ -15,7 +15,7 @@ from sb3_chac.common.checks import check_integer, check_learning_rate, check_ran
 from sb3_chac.common.critics import DistributionalCritic
 from sb3_chac.common.distributional import gaussian_nll, gaussian_surrogate_loss, return_targets
 from sb3_chac.common.off_policy_algorithm import CheckedOffPolicyAlgorithm
-from sb3_chac.common.utils import TargetUpdate, frozen, minimize
+from sb3_chac.common.utils import TargetUpdate, frozen, initial_ent_coef, minimize
 from sb3_chac.dsac.policies import CnnPolicy, DSACPolicy, MlpPolicy, MultiInputPolicy
 
 SelfDSAC = TypeVar("SelfDSAC", bound="DSAC")
@@ -195,7 +195,7 @@ class DSAC(CheckedOffPolicyAlgorithm):
 
         learn_ent_coef = isinstance(self.ent_coef, str)
         with th.no_grad():
-            self.log_ent_coef.fill_(self._initial_ent_coef()).log_()
+            self.log_ent_coef.fill_(initial_ent_coef(self.ent_coef)).log_()
         self.log_ent_coef.requires_grad_(learn_ent_coef)
         if learn_ent_coef:
             self.ent_coef_optimizer = th.optim.Adam([self.log_ent_coef], lr=self.ent_coef_lr_schedule(1.0), fused=True)
@@ -211,22 +211,6 @@ class DSAC(CheckedOffPolicyAlgorithm):
         self.critic_target = self.policy.critic_target
         self.log_ent_coef = self.policy.log_ent_coef
 
-    def _initial_ent_coef(self) -> float:
-        """
-        :return: alpha at the start: 1 for 'auto', x for 'auto_x' and for the number x
-        """
-        if not isinstance(self.ent_coef, str):
-            check_range("ent_coef", self.ent_coef, low=0.0)
-            return float(self.ent_coef)
-        kind, _, value = self.ent_coef.partition("_")
-        try:
-            initial = float(value) if value else 1.0
-        except ValueError:
-            initial = -1.0
-        if kind != "auto" or initial <= 0:
-            raise ValueError(f"ent_coef must be 'auto', 'auto_0.1' (0.1 to start with) or a number, got {self.ent_coef!r}.")
-        return initial
-
     def _check_arguments(self) -> None:
         super()._check_arguments()
         check_learning_rate("ent_coef_lr", self.ent_coef_lr)
@@ -237,7 +221,7 @@ class DSAC(CheckedOffPolicyAlgorithm):
             check_range("tau_b", self.tau_b, low=0.0, high=1.0)
         if self.target_entropy != "auto":
             check_range("target_entropy", self.target_entropy)
-        self._initial_ent_coef()
+        initial_ent_coef(self.ent_coef)
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
         # Switch to train mode (this affects batch norm / dropout)

@@ -1,7 +1,6 @@
 """Recording demonstrations: episodes of an expert, or of a novice whom an expert watches, as a dataset of Minari."""
 
 import contextlib
-import io
 import itertools
 import multiprocessing
 import os
@@ -22,10 +21,9 @@ from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.common.vec_env.base_vec_env import CloudpickleWrapper
 from tqdm import tqdm
 
-from sb3_chac.chac import CHAC
 from sb3_chac.common.checks import check_integer
 from sb3_chac.common.episodes import Runner, SavedModel, Task, make_env
-from sb3_chac.common.evaluation import policy_name, scenario_list
+from sb3_chac.common.evaluation import policy_name, saved_model, scenario_list
 from sb3_chac.human.dataset_writer import DatasetWriter, folder_to_make
 from sb3_chac.human.demonstrations import DatasetError, check_spaces
 from sb3_chac.human.intervention import InterventionWrapper
@@ -198,15 +196,6 @@ class Recorder(Runner):
             **({"novice_action": np.array(action)} if watched else {}),
             **{key: kind(info[key]) for key, kind in (("cost", float), ("is_success", bool)) if key in info},
         }
-
-
-def saved_model(model: BaseAlgorithm) -> SavedModel:
-    """
-    :return: the model in a form that can be sent to another process
-    """
-    archive = io.BytesIO()
-    model.save(archive)
-    return SavedModel(type(model), archive.getvalue(), model.policy.control if isinstance(model, CHAC) else None)
 
 
 def recorded_episodes(recorder: Recorder, jobs: int) -> Generator["EpisodeBuffer"]:

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 class MetaDrivesDriver:
     """
-    A driver that comes with MetaDrive. What it does threatens is predicted as for the scripted driver.
+    A driver that comes with MetaDrive. Trouble is predicted as by the scripted driver.
 
     :param env: the environment in which it drives
     """
@@ -34,6 +34,9 @@ class MetaDrivesDriver:
         return np.clip(self.act(), -1.0, 1.0).astype(np.float32)
 
     def act(self) -> Any:
+        """
+        :return: steering and throttle, of any range
+        """
         raise NotImplementedError
 
     def time_to_trouble(self, observation: np.ndarray | None, action: np.ndarray) -> float:
@@ -61,13 +64,7 @@ class PPODriver(MetaDrivesDriver):
         return expert(self.env.ego, deterministic=True)
 
 
-def make_driver(name: str, env: "MetaDriveSafetyEnv") -> Any:
-    """
-    :param name: one of ``DRIVERS``
-    """
-    return DRIVERS[name](env)
-
-
+# Name -> environment -> driver
 DRIVERS: dict[str, Any] = {
     "scripted": lambda env: ScriptedDriver(env, reaction_delay=3, action_noise=0.1),
     "scripted-ideal": lambda env: ScriptedDriver(env, reaction_delay=0, action_noise=0.0),

@@ -8,7 +8,7 @@ from gymnasium import spaces
 
 from sb3_chac.common.checks import check_integer, check_range
 from sb3_chac.envs.display import STEPS_PER_SECOND
-from sb3_chac.envs.metadrive.drivers import DRIVERS, make_driver
+from sb3_chac.envs.metadrive.drivers import DRIVERS
 from sb3_chac.envs.metadrive.simulator import check_installed, is_headless, make_simulator, prepare, release
 
 N_OBSERVATION = 259
@@ -144,9 +144,10 @@ class MetaDriveSafetyEnv(gym.Env):
         observation, info = self.simulator.reset(seed=self.scenario)
         self.steps, self.episode_cost, self.collisions = 0, 0, 0
         self._touched: dict[Any, int] = {}  # object -> step of the last contact
+        info = self._info(info)
         if self.render_mode == "human":
             self.render()
-        return self._clipped(observation), self._info(info)
+        return self._clipped(observation), info
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         steering, throttle = np.clip(np.asarray(action, dtype=float), -1.0, 1.0)
@@ -154,9 +155,10 @@ class MetaDriveSafetyEnv(gym.Env):
         observation, reward, terminated, truncated, info = self.simulator.step([steering, throttle])
         self.steps += 1
         self._count_collisions(info)
+        info = self._info(info)
         if self.render_mode == "human":
             self.render()
-        return self._clipped(observation), float(reward), bool(terminated), bool(truncated), self._info(info)
+        return self._clipped(observation), float(reward), bool(terminated), bool(truncated), info
 
     def _count_collisions(self, info: dict[str, Any]) -> None:
         """
@@ -242,7 +244,7 @@ class MetaDriveSafetyEnv(gym.Env):
         """
         if name not in DRIVERS:
             raise ValueError(f"{name!r} is not a driver of MetaDriveSafety, choose from {sorted(DRIVERS)}.")
-        return make_driver(name, self)
+        return DRIVERS[name](self)
 
     # Pictures
 
