@@ -1,7 +1,8 @@
-"""MetaDriveSafety-v0: how its drivers do.
+"""MetaDriveSafety-v0: how its drivers do, and what is observed.
 
     python benchmarks/metadrive_safety.py drivers --jobs 2   # its drivers on 100 maps; runs what is missing
     python benchmarks/metadrive_safety.py report             # table of the means
+    python benchmarks/metadrive_safety.py observations       # means and standard deviations of MetaDrive's observations
 
 Needs MetaDrive (Python 3.11), goes without its assets. (A script called metadrive.py would hide it.) One row per preset,
 driver and map is appended to benchmarks/results/metadrive/drivers.csv. Maps: 1000-1099. None of these was used while
@@ -21,6 +22,7 @@ import numpy as np
 import torch as th
 
 import sb3_chac.envs  # noqa: F401
+from sb3_chac import InterventionWrapper
 from sb3_chac.envs.metadrive import PRESETS
 
 DRIVERS_CSV = Path(__file__).parent / "results" / "metadrive" / "drivers.csv"
@@ -101,6 +103,27 @@ def drivers(args: argparse.Namespace) -> None:
     report(args)
 
 
+def observations(args: argparse.Namespace) -> None:
+    """Of a novice who drives as the scripted driver plus much slow noise, and whom the human takes over (maps 100-111)."""
+    env = InterventionWrapper(gym.make("MetaDriveSafety-v0", raw_observations=True, headless=True), armed=True)
+    rng = np.random.default_rng(0)
+    driver, noise, seen = env.unwrapped.scripted_driver("scripted"), np.zeros(2), []
+    for scenario in range(100, 112):
+        observation, _ = env.reset(seed=scenario, options={"scenario": scenario})
+        driver.reset(scenario)
+        done = False
+        while not done:
+            noise = 0.95 * noise + 0.1 * rng.normal(size=2)
+            action = np.clip(driver(observation) + noise, -1, 1).astype(np.float32)
+            observation, _, terminated, truncated, _ = env.step(action)
+            seen.append(observation)
+            done = terminated or truncated
+    values = np.array(seen)
+    with np.printoptions(precision=2, suppress=True):
+        print(f"{len(values)} steps\nmeans {values[:, :19].mean(axis=0)}\nstandard deviations {values[:, :19].std(axis=0)}")
+    print(f"lidar: mean {values[:, 19:].mean():.3f}, {(values[:, 19:] > 0.999).mean():.0%} free")
+
+
 def report(args: argparse.Namespace) -> None:
     rows = read()
     print("| preset | driver | episodes | " + " | ".join(name.replace("_", " ") for name in COLUMNS) + " |")
@@ -113,7 +136,7 @@ def report(args: argparse.Namespace) -> None:
 
 
 if __name__ == "__main__":
-    commands = {f.__name__: f for f in (drivers, report)}
+    commands = {f.__name__: f for f in (drivers, report, observations)}
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("command", choices=commands)
     parser.add_argument("--jobs", type=int, default=2, help="processes at once, one torch thread each")

@@ -13,7 +13,10 @@ if TYPE_CHECKING:
     from sb3_chac.cql import CQL
     from sb3_chac.dpvp import DPVP
     from sb3_chac.dsac import DSAC
+    from sb3_chac.gail import GAIL
+    from sb3_chac.hg_dagger import HGDagger
     from sb3_chac.human import InterventionWrapper
+    from sb3_chac.iwr import IWR
     from sb3_chac.ppo_lag import PPOLag
     from sb3_chac.pvp import PVP
     from sb3_chac.sac_lag import SACLag
@@ -27,13 +30,30 @@ _EXPORTS = {
     "CQL": "sb3_chac.cql",
     "DPVP": "sb3_chac.dpvp",
     "DSAC": "sb3_chac.dsac",
+    "GAIL": "sb3_chac.gail",
+    "HGDagger": "sb3_chac.hg_dagger",
+    "IWR": "sb3_chac.iwr",
     "InterventionWrapper": "sb3_chac.human",
     "PPOLag": "sb3_chac.ppo_lag",
     "PVP": "sb3_chac.pvp",
     "SACLag": "sb3_chac.sac_lag",
 }
 
-__all__ = ["BC", "CHAC", "CQL", "DPVP", "DSAC", "PVP", "InterventionWrapper", "PPOLag", "SACLag", "__version__"]
+__all__ = [
+    "BC",
+    "CHAC",
+    "CQL",
+    "DPVP",
+    "DSAC",
+    "GAIL",
+    "IWR",
+    "PVP",
+    "HGDagger",
+    "InterventionWrapper",
+    "PPOLag",
+    "SACLag",
+    "__version__",
+]
 
 
 def __getattr__(name: str) -> Any:

@@ -16,7 +16,7 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_chac.bc import BC
-from sb3_chac.bc.bc import gaussian_nll, squared_errors
+from sb3_chac.bc.policies import gaussian_nll, squared_errors
 from sb3_chac.common.checkpoints import ResumableCheckpoint, newest_checkpoint
 from sb3_chac.common.offline import DatasetSampler
 from sb3_chac.cql import CQL

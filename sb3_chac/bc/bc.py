@@ -1,4 +1,3 @@
-import math
 import os
 from collections import defaultdict
 from typing import Any, ClassVar, TypeVar
@@ -7,9 +6,8 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
-from torch.nn import functional as F
 
-from sb3_chac.bc.policies import BCPolicy, CnnPolicy, MlpPolicy
+from sb3_chac.bc.policies import LOSSES, BCPolicy, CnnPolicy, MlpPolicy
 from sb3_chac.common.checks import check_range
 from sb3_chac.common.offline import Batch, OfflineAlgorithm
 from sb3_chac.common.utils import minimize
@@ -17,7 +15,6 @@ from sb3_chac.human.demonstrations import Demonstrations
 
 SelfBC = TypeVar("SelfBC", bound="BC")
 
-LOSSES = ("mse", "nll")
 VALIDATION_BATCH = 4096  # steps whose loss is computed at once
 
 
@@ -115,19 +112,9 @@ class BC(OfflineAlgorithm):
         return [self.policy.optimizer]
 
     def _gradient_step(self, batch: Batch) -> dict[str, th.Tensor]:
-        loss = self._losses(batch).mean()
+        loss = self.policy.losses(batch.observations, batch.actions).mean()
         minimize(loss, self.policy.optimizer)
         return {"loss": loss.detach()}
-
-    def _losses(self, batch: Batch) -> th.Tensor:
-        """
-        :return: shape (batch_size,)
-        """
-        if isinstance(self.action_space, spaces.Discrete):
-            return F.cross_entropy(self.policy.action_logits(batch.observations), batch.actions, reduction="none")
-        if self.loss == "mse":
-            return squared_errors(self.policy.action_mean(batch.observations), batch.actions)
-        return gaussian_nll(*self.policy.action_mean_and_log_std(batch.observations), batch.actions)
 
     @th.no_grad()
     def validation_loss(self) -> float | None:
@@ -139,8 +126,8 @@ class BC(OfflineAlgorithm):
         if len(steps) == 0:
             return None
         self.policy.set_training_mode(False)
-        parts = [steps[start : start + VALIDATION_BATCH] for start in range(0, len(steps), VALIDATION_BATCH)]
-        return float(th.cat([self._losses(self._batch(part)) for part in parts]).mean())
+        parts = [self._batch(steps[start : start + VALIDATION_BATCH]) for start in range(0, len(steps), VALIDATION_BATCH)]
+        return float(th.cat([self.policy.losses(part.observations, part.actions) for part in parts]).mean())
 
     def _dump_logs(self, stats: defaultdict[str, list[th.Tensor]]) -> None:
         validation_loss = self.validation_loss()
@@ -161,23 +148,3 @@ class BC(OfflineAlgorithm):
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "policy.optimizer"], []
-
-
-def squared_errors(means: th.Tensor, actions: th.Tensor) -> th.Tensor:
-    """
-    :param means: shape (batch_size, action_dim)
-    :param actions: same shape
-    :return: mean over the dimensions of (mean - action)^2, shape (batch_size,)
-    """
-    return (means - actions).square().mean(dim=1)
-
-
-def gaussian_nll(means: th.Tensor, log_stds: th.Tensor, actions: th.Tensor) -> th.Tensor:
-    """
-    :param means: shape (batch_size, action_dim)
-    :param log_stds: same shape
-    :param actions: same shape
-    :return: ``-log N(action; mean, std^2)``, summed over the dimensions, shape (batch_size,)
-    """
-    errors = (actions - means) * (-log_stds).exp()
-    return (0.5 * errors.square() + log_stds + 0.5 * math.log(2 * math.pi)).sum(dim=1)

@@ -1,3 +1,4 @@
+import math
 from typing import Any, ClassVar
 
 import torch as th
@@ -7,7 +8,9 @@ from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor, NatureCNN, create_mlp
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
+from torch.nn import functional as F
 
+LOSSES = ("mse", "nll")
 LOG_STD_MIN, LOG_STD_MAX = -5.0, 2.0
 
 
@@ -95,6 +98,18 @@ class BCPolicy(BasePolicy):
         latent = self._latent(observations)
         return self.mu(latent), self.log_std(latent).clamp(LOG_STD_MIN, LOG_STD_MAX)
 
+    def losses(self, observations: PyTorchObs, actions: th.Tensor) -> th.Tensor:
+        """
+        :param actions: demonstrated, scaled to [-1, 1], shape (batch_size, action_dim); if discrete, from 0 on, shape
+            (batch_size,)
+        :return: "nll" if the policy is stochastic, else "mse", shape (batch_size,)
+        """
+        if isinstance(self.action_space, spaces.Discrete):
+            return F.cross_entropy(self.action_logits(observations), actions, reduction="none")
+        if self.stochastic:
+            return gaussian_nll(*self.action_mean_and_log_std(observations), actions)
+        return squared_errors(self.action_mean(observations), actions)
+
     def forward(self, observations: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         return self._predict(observations, deterministic)
 
@@ -130,3 +145,23 @@ class CnnPolicy(BCPolicy):
     """Policy for image observations: ``BCPolicy`` with the CNN of the DQN Nature paper as features extractor."""
 
     default_features_extractor = NatureCNN
+
+
+def squared_errors(means: th.Tensor, actions: th.Tensor) -> th.Tensor:
+    """
+    :param means: shape (batch_size, action_dim)
+    :param actions: same shape
+    :return: mean over the dimensions of (mean - action)^2, shape (batch_size,)
+    """
+    return (means - actions).square().mean(dim=1)
+
+
+def gaussian_nll(means: th.Tensor, log_stds: th.Tensor, actions: th.Tensor) -> th.Tensor:
+    """
+    :param means: shape (batch_size, action_dim)
+    :param log_stds: same shape
+    :param actions: same shape
+    :return: ``-log N(action; mean, std^2)``, summed over the dimensions, shape (batch_size,)
+    """
+    errors = (actions - means) * (-log_stds).exp()
+    return (0.5 * errors.square() + log_stds + 0.5 * math.log(2 * math.pi)).sum(dim=1)

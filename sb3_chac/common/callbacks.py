@@ -17,8 +17,9 @@ PROGRESS_FILE = "progress.csv"
 class GuidedProgressBar(ProgressBarCallback):
     """
     SB3's progress bar which also tells, for an algorithm that learns from takeovers, what the human does: the stage of the
-    training (C-HAC), the share and number of steps that the human drove and the safety cost, since the start of the training;
-    and in stage 2 the share of the latest steps that the self-learning policy drove.
+    training (C-HAC) or the round (HG-DAgger, IWR; 0 is the warm-up), the share and number of steps that the human drove and
+    the safety cost, since the start of the training; and in stage 2 the share of the latest steps that the self-learning
+    policy drove.
 
     :param refresh_every: number of calls between two updates of the text
     """
@@ -50,7 +51,7 @@ class GuidedProgressBar(ProgressBarCallback):
         :return: e.g. "stage 2, self 31 %, human 12 % (1850 steps), cost 9"
         """
         counts = self.model.counts
-        parts = [f"stage {self.model.stage}"] if hasattr(self.model, "stage") else []
+        parts = [f"{name} {getattr(self.model, name)}" for name in ("stage", "round") if hasattr(self.model, name)]
         choices: dict[str, list[np.ndarray]] = getattr(self.model, "choices", {})
         if choices:  # else the logger has just taken them
             self.self_share = float(np.mean(choices["self_drives"][-self.refresh_every :]))

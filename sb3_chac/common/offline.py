@@ -17,7 +17,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_chac.common.checks import check_action_space, check_integer, check_learning_rate, check_range
-from sb3_chac.human.demonstrations import HOW_TO_GET_ONE, DatasetError, Demonstrations, check_spaces, load_demonstrations
+from sb3_chac.human.demonstrations import Demonstrations, check_spaces, load_demonstrations, missing_dataset
 
 SelfOffline = TypeVar("SelfOffline", bound="OfflineAlgorithm")
 
@@ -179,11 +179,7 @@ class OfflineAlgorithm(BaseAlgorithm):
         """
         self.dataset = dataset
         if dataset is None:
-            name = type(self).__name__
-            raise DatasetError(
-                f"dataset: {name} learns from demonstrations, and has none. Pass {name}(..., dataset='safedrive/scripted-v0') "
-                f"or load(..., dataset=...), in RL-Zoo3 -params \"dataset:'safedrive/scripted-v0'\". {HOW_TO_GET_ONE}"
-            )
+            raise missing_dataset(type(self).__name__)
         self._demonstrations = load_demonstrations(dataset, self.observation_space, self.action_space)
         self._loaded_from = dataset
         self._sampler = DatasetSampler(self._demonstrations.episodes, self.batch_size, self.validation_share, self.seed)

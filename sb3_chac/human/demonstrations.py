@@ -26,6 +26,17 @@ class DatasetError(ValueError):
     """Raised for a dataset that is missing, damaged, empty or made for other spaces; says what is wrong and what to do."""
 
 
+def missing_dataset(algorithm: str) -> DatasetError:
+    """
+    :param algorithm: name of the class
+    """
+    return DatasetError(
+        f"dataset: {algorithm} learns from demonstrations, and has none. Pass "
+        f"{algorithm}(..., dataset='safedrive/scripted-v0') or load(..., dataset=...), in RL-Zoo3 "
+        f"-params \"dataset:'safedrive/scripted-v0'\". {HOW_TO_GET_ONE}"
+    )
+
+
 @dataclass(frozen=True, eq=False)
 class Demonstrations:
     """

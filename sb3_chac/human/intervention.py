@@ -90,6 +90,7 @@ class InterventionWrapper(gym.Wrapper, RecordConstructorArgs):
             check_integer("budget", budget, low=0)
         self.budget = budget
         self._expert_argument, self._rule_argument = expert, rule
+        self._rule_in_force = rule
         self._expert: Expert | None = None  # both are built when first armed
         self._rule: TakeoverRule | None = None
         self._armed = False
@@ -132,7 +133,7 @@ class InterventionWrapper(gym.Wrapper, RecordConstructorArgs):
             return
         if self._expert is None or self._rule is None:
             expert = make_expert(self._expert_argument, self.env)
-            self._rule = make_rule(self._rule_argument, self.env, expert)
+            self._rule = make_rule(self._rule_in_force, self.env, expert)
             self._expert = expert
         if self._budget_is_spent():
             self._on("pause")
@@ -145,6 +146,20 @@ class InterventionWrapper(gym.Wrapper, RecordConstructorArgs):
         self._on("hand back")
         self._on("resume")
         self._armed = False
+
+    def set_rule(self, rule: Any = None) -> None:
+        """
+        From the next step on another rule decides, e.g. "always" while the human demonstrates.
+
+        :param rule: see ``make_rule``; None for the rule that the wrapper was made with
+        :raises ValueError: for a rule that does not fit; nothing is changed then
+        """
+        rule = self._rule_argument if rule is None else rule
+        check_rule(rule, self._expert_argument)
+        if self._expert is not None:
+            self._rule = make_rule(rule, self.env, self._expert)
+            self._rule.reset()
+        self._rule_in_force = rule
 
     def pause(self) -> None:
         """
@@ -310,7 +325,7 @@ class InterventionWrapper(gym.Wrapper, RecordConstructorArgs):
         assert self._rule is not None
         takeover = self._rule(observation, novice_action, expert_action, was_driving)
         if not isinstance(takeover, bool | np.bool_):
-            raise TypeError(f"rule must return True or False, got {takeover!r} from {self._rule_argument!r}.")
+            raise TypeError(f"rule must return True or False, got {takeover!r} from {self._rule_in_force!r}.")
         return bool(takeover)
 
     def _checked_novice_action(self, action: Any) -> np.ndarray:

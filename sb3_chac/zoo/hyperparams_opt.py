@@ -141,7 +141,7 @@ def sample_bc_params(trial: optuna.Trial, n_actions: int, n_envs: int, additiona
 def convert_bc_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
     """
     :param sampled_params: as Optuna stores them
-    :return: keyword arguments of BC, which has no discount factor
+    :return: keyword arguments of BC, HGDagger or IWR, which have no discount factor
     """
     params = convert_offpolicy_params(sampled_params | {"one_minus_gamma": 0.0})
     del params["gamma"]
@@ -166,6 +166,28 @@ def sample_cql_params(trial: optuna.Trial, n_actions: int, n_envs: int, addition
     return convert_offpolicy_params(params)
 
 
+def sample_gail_params(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> dict[str, Any]:
+    """
+    :return: keyword arguments of GAIL. For the parameters see ``sample_dsac_params``
+    """
+    return sample_ppo_params(trial, n_actions, n_envs, additional_args) | {
+        "disc_learning_rate": trial.suggest_float("disc_learning_rate", 1e-5, 0.003, log=True),
+        "n_disc_updates": trial.suggest_int("n_disc_updates", 1, 32, log=True),
+        "disc_batch_size": trial.suggest_categorical("disc_batch_size", [128, 256, 512, 1024]),
+        "gradient_penalty": trial.suggest_categorical("gradient_penalty", [0.0, 1.0, 10.0]),
+    }
+
+
+def sample_dagger_params(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> dict[str, Any]:
+    """
+    The budgets of the human are the task's and not tuned.
+
+    :return: keyword arguments of HGDagger and IWR. For the parameters see ``sample_dsac_params``
+    """
+    params = sample_bc_params(trial, n_actions, n_envs, additional_args)
+    return params | {"n_epochs": trial.suggest_int("n_epochs", 5, 80, log=True)}
+
+
 HYPERPARAMS_SAMPLER: dict[str, Callable[..., dict[str, Any]]] = {
     "dsac": sample_dsac_params,
     "pvp": sample_pvp_params,
@@ -175,9 +197,13 @@ HYPERPARAMS_SAMPLER: dict[str, Callable[..., dict[str, Any]]] = {
     "ppo_lag": sample_ppo_lag_params,
     "bc": sample_bc_params,
     "cql": sample_cql_params,
+    "gail": sample_gail_params,
+    "hg_dagger": sample_dagger_params,
+    "iwr": sample_dagger_params,
 }
 HYPERPARAMS_CONVERTER: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
     **dict.fromkeys(HYPERPARAMS_SAMPLER, convert_offpolicy_params),
     "ppo_lag": convert_onpolicy_params,
-    "bc": convert_bc_params,
+    "gail": convert_onpolicy_params,
+    **dict.fromkeys(("bc", "hg_dagger", "iwr"), convert_bc_params),
 }

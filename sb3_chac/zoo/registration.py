@@ -16,6 +16,9 @@ ALGORITHMS = {
     "ppo_lag": "PPOLag",
     "bc": "BC",
     "cql": "CQL",
+    "gail": "GAIL",
+    "hg_dagger": "HGDagger",
+    "iwr": "IWR",
 }
 
 

@@ -19,6 +19,14 @@ SPAWN = {
     "use_special_color": True,
     "spawn_lane_index": (">", ">>", 0),
 }
+# Of MetaDrive's first 19 observations, the others are lidar: means and standard deviations where novice and human drive
+# (benchmarks/metadrive_safety.py observations). The fifth, the steering, hardly moves in MetaDrive 0.4.3: it is left small
+MEANS = [0.3, 0.3, 0.5, 0.75, 0.5, 0.5, 0.64, 0.28, 0.5, 0.71, 0.49, 0.17, 0.5, 0.6, 0.87, 0.49, 0.12, 0.48, 0.58]
+STDS = [0.15, 0.17, 0.1, 0.2, 0.1, 0.12, 0.16, 0.2, 0.17, 0.15, 0.1, 0.28, 0.29, 0.15, 0.12, 0.2, 0.23, 0.26, 0.13]
+N_LIDAR = N_OBSERVATION - len(MEANS)
+# (MetaDrive's - OFFSET) * SCALE is what the agent sees; rays become closeness
+OFFSET = np.array([*MEANS, *[1.0] * N_LIDAR], dtype=np.float32)
+SCALE = np.array([*[1 / std for std in STDS], *[-1.0] * N_LIDAR], dtype=np.float32)
 FULL_BRAKE = 1.5  # [m/s] that braking with all its might takes off the speed in a step, at least
 
 
@@ -44,9 +52,10 @@ class MetaDriveSafetyEnv(gym.Env):
 
     **Actions**, shape (2,), in [-1, 1]: steering (1 is 40 degrees of the front wheels to the left) and throttle or brake.
 
-    **Observations**, shape (259,), in [0, 1]: MetaDrive's: 9 of the ego (distances to the left and the right edge, heading,
-    speed, steering, last action, yaw rate, offset in the lane), 10 of the next two checkpoints, and 240 lidar rays up to 50 m
-    (1 is free).
+    **Observations**, shape (259,): MetaDrive's, scaled: 9 of the ego (distances to the left and the right edge, heading,
+    speed, steering, last action, yaw rate, offset in the lane) and 10 of the next two checkpoints, all with a mean near 0 and
+    a standard deviation near 1, and 240 lidar rays as closeness (0 is free up to 50 m, 1 touching). With
+    ``raw_observations`` they stay in [0, 1], rays as distances (1 is free), from which learning is far slower.
 
     **Reward**: MetaDrive's: metres along the lane + 0.1 v / v_max, but on a step in contact with something -5 in its place, on
     arrival +10, off the road or the route -5.
@@ -71,6 +80,7 @@ class MetaDriveSafetyEnv(gym.Env):
     :param traffic_density: vehicles per 10 m of lane
     :param max_speed: [km/h] of the ego
     :param horizon: [steps of 0.1 s] after which an episode is truncated
+    :param raw_observations: give MetaDrive's own observations
     :param headless: go without MetaDrive's assets, None to let the environment variable SB3_CHAC_METADRIVE_HEADLESS decide
     :param render_mode: "rgb_array", "human" or None: seen from above
     :raises ValueError: for an argument out of its range
@@ -89,6 +99,7 @@ class MetaDriveSafetyEnv(gym.Env):
         traffic_density: float | None = None,
         max_speed: float | None = None,
         horizon: int | None = None,
+        raw_observations: bool = False,
         headless: bool | None = None,
         render_mode: str | None = None,
     ) -> None:
@@ -113,7 +124,9 @@ class MetaDriveSafetyEnv(gym.Env):
         self.render_mode = render_mode
         self.hud: dict[str, Any] = {}  # what wrappers want to have shown beside the speed
         self.action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
-        self.observation_space = spaces.Box(0.0, 1.0, (N_OBSERVATION,), np.float32)
+        self.raw_observations = bool(raw_observations)
+        bounds = self._observed(np.zeros(N_OBSERVATION)), self._observed(np.ones(N_OBSERVATION))
+        self.observation_space = spaces.Box(np.minimum(*bounds), np.maximum(*bounds), dtype=np.float32)
         self._viewer: Any = None
         self.simulator = make_simulator(
             self,
@@ -147,7 +160,7 @@ class MetaDriveSafetyEnv(gym.Env):
         info = self._info(info)
         if self.render_mode == "human":
             self.render()
-        return self._clipped(observation), info
+        return self._observed(observation), info
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         steering, throttle = np.clip(np.asarray(action, dtype=float), -1.0, 1.0)
@@ -158,7 +171,7 @@ class MetaDriveSafetyEnv(gym.Env):
         info = self._info(info)
         if self.render_mode == "human":
             self.render()
-        return self._clipped(observation), float(reward), bool(terminated), bool(truncated), info
+        return self._observed(observation), float(reward), bool(terminated), bool(truncated), info
 
     def _count_collisions(self, info: dict[str, Any]) -> None:
         """
@@ -217,9 +230,9 @@ class MetaDriveSafetyEnv(gym.Env):
         }
         return dict(self.last_info)
 
-    @staticmethod
-    def _clipped(observation: np.ndarray) -> np.ndarray:
-        return np.clip(observation, 0.0, 1.0, dtype=np.float32)
+    def _observed(self, observation: np.ndarray) -> np.ndarray:
+        clipped = np.clip(observation, 0.0, 1.0, dtype=np.float32)
+        return clipped if self.raw_observations else (clipped - OFFSET) * SCALE
 
     @property
     def ego(self) -> Any:
