@@ -325,3 +325,26 @@ class Plain(Integrator):
 
 def test_environments_without_a_display_are_left_alone():
     assert "hud" not in armed("never", env=Plain()).render()
+
+
+def test_another_rule_for_a_while():
+    env = armed("never")
+    assert drive(env, 2) == [False, False]
+    env.set_rule("always")
+    assert drive(env, 2) == [True, True]
+    env.disarm()
+    env.set_rule()
+    env.arm()
+    assert drive(env, 2) == [False, False]
+    env.disarm()
+    assert not env.armed and drive(env, 1) == [False]
+    with pytest.raises(ValueError, match=r"^rule must be one of"):
+        env.set_rule("sometimes")
+    env.arm()
+    assert drive(env, 1) == [False]
+    # Before it is armed for the first time, too
+    env = InterventionWrapper(Integrator(), constant, "never")
+    env.set_rule("always")
+    env.reset(seed=0)
+    env.arm()
+    assert drive(env, 1) == [True]

@@ -56,5 +56,5 @@ def intervention_weights(is_intervention: np.ndarray) -> np.ndarray:
     """
     n, n_interventions = len(is_intervention), np.count_nonzero(is_intervention)
     if n_interventions in (0, n):
-        return np.full(n, 1 / n)
+        return np.full(n, 1 / max(n, 1))
     return np.where(is_intervention, 0.5 / n_interventions, 0.5 / (n - n_interventions))

@@ -178,7 +178,8 @@ class ScriptedDriver:
         self._locate()
         self.seen.append(self._look(TIMES))
         target, slope, acceleration, cap = self._plan(self.seen[0])
-        self.boxed_in = self.boxed_in + 0.1 if self.speed < 0.3 else max(0.0, self.boxed_in - 0.05)
+        waited = 0.5 if self.env.last_info["contact"] else 0.1  # who touches already has little to wait for
+        self.boxed_in = self.boxed_in + waited if self.speed < 0.3 else max(0.0, self.boxed_in - 0.05)
         if self.speed < DAWDLING * cap and acceleration > 0:
             self.dawdled = min(self.dawdled + 0.1, PATIENCE + 1.0)
         else:
@@ -437,6 +438,7 @@ class ScriptedDriver:
         behind = along > self.length / 2 + half_length
         stays = (np.abs(self.route.targets - self.lateral) < 2.0)[:, None, None]
         hit &= ~(behind & moves & (np.abs(angle) < 0.3) & stays)  # who follows keeps the distance
+        hit &= ~self._beside(others)[:, None, None, None]  # every plan begins with that
         if self.boxed_in > BOXED_IN_FOR:  # nothing else helps: push through
             hit &= moves
         first = np.argmax(hit, axis=-1)
@@ -447,3 +449,16 @@ class ScriptedDriver:
         # Before something that stands in the way, keep the room to swing out
         room = np.where((gap_across < 0.3) & ~behind, np.maximum(7.0 - gap_along, 0.0), 0.0)
         return collision + 1.5 * (self.boxed_in < BOXED_IN_FOR) * room.max(axis=-1).sum(axis=0)
+
+    def _beside(self, others: Others) -> np.ndarray:
+        """
+        :return: whether it stands and touches the ego, or nearly so, but not in front, shape (n,)
+        """
+        d, angle = others.positions[:, 0] - self.position, others.headings[:, 0] - self.heading
+        cos, sin = np.cos(self.heading), np.sin(self.heading)
+        along, across = d[:, 0] * cos + d[:, 1] * sin, d[:, 1] * cos - d[:, 0] * sin
+        half_length, half_width = half_extents(others.lengths[:, 0], others.widths[:, 0], angle)
+        gap_along = np.abs(along) - self.length / 2 - half_length
+        gap_across = np.abs(across) - self.width / 2 - half_width
+        in_front = (along > 0.0) & (gap_across < 0.0)
+        return ~others.moves & (gap_along < 0.8) & (gap_across < 0.4) & ~in_front
