@@ -301,3 +301,22 @@ def test_bad_arguments_of_risk_rule(name, value):
 def test_bad_arguments_of_disagreement_rule(threshold, space):
     with pytest.raises(ValueError, match=r"threshold|action space"):
         DisagreementRule(threshold, space)
+
+
+def test_rules_can_be_configured():
+    env = DrivenIntegrator()
+    rule = make_rule("risk", env, env.scripted_driver("scripted"), {"take_over_below": 1.8, "hold": 3})
+    assert isinstance(rule, RiskRule) and (rule.take_over_below, rule.hold, rule.hand_back_above) == (1.8, 3, 2.0)
+    assert make_rule("disagreement", env, constant, {"threshold": 0.7}).threshold == 0.7
+    wrapped = InterventionWrapper(env, rule="risk", rule_kwargs={"hold": 4}, armed=True)
+    assert wrapped.get_wrapper_attr("_rule").hold == 4
+    wrapped.reset(seed=0)
+    wrapped.set_rule("never")
+    wrapped.set_rule()
+    assert wrapped.get_wrapper_attr("_rule").hold == 4
+    with pytest.raises(ValueError, match=r"^rule_kwargs: .*do not fit rule='risk'.*holds"):
+        InterventionWrapper(env, rule_kwargs={"holds": 4})
+    with pytest.raises(ValueError, match=r"^hold must be"):
+        InterventionWrapper(env, rule_kwargs={"hold": 0})
+    with pytest.raises(ValueError, match=r"^rule_kwargs: only 'risk' and 'disagreement' take any, got rule='never'"):
+        InterventionWrapper(env, rule="never", rule_kwargs={"hold": 4})

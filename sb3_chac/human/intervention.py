@@ -67,6 +67,7 @@ class InterventionWrapper(gym.Wrapper, RecordConstructorArgs):
     :param rule: when: "risk", "disagreement", "always", "never", a ``TakeoverRule`` or a function, see ``make_rule``
     :param budget: how many steps the human drives at most (of this environment, over all episodes), None for no limit
     :param armed: whether to arm it at once
+    :param rule_kwargs: of the rule if it is "risk" (e.g. ``{"take_over_below": 1.8}``, see ``RiskRule``) or "disagreement"
     :raises ValueError: for an argument that does not fit; while armed, for an action that is not finite or of another shape
     :raises ExpertError: from ``reset``, ``step`` and ``arm`` when the expert fails
     """
@@ -78,19 +79,22 @@ class InterventionWrapper(gym.Wrapper, RecordConstructorArgs):
         rule: Any = "risk",
         budget: int | None = None,
         armed: bool = False,
+        rule_kwargs: dict[str, Any] | None = None,
     ):
         # Not copied: a model may hold a replay buffer or subprocesses
-        RecordConstructorArgs.__init__(self, _disable_deepcopy=True, expert=expert, rule=rule, budget=budget, armed=armed)
+        RecordConstructorArgs.__init__(
+            self, _disable_deepcopy=True, expert=expert, rule=rule, budget=budget, armed=armed, rule_kwargs=rule_kwargs
+        )
         gym.Wrapper.__init__(self, env)
         check_action_space(env.action_space)
         self._box: spaces.Box = env.action_space  # type: ignore[assignment]
         check_expert(expert, env)
-        check_rule(rule, expert)
+        check_rule(rule, expert, rule_kwargs)
         if budget is not None:
             check_integer("budget", budget, low=0)
         self.budget = budget
-        self._expert_argument, self._rule_argument = expert, rule
-        self._rule_in_force = rule
+        self._expert_argument, self._rule_arguments = expert, (rule, rule_kwargs)
+        self._rule_in_force = self._rule_arguments
         self._expert: Expert | None = None  # both are built when first armed
         self._rule: TakeoverRule | None = None
         self._armed = False
@@ -133,7 +137,8 @@ class InterventionWrapper(gym.Wrapper, RecordConstructorArgs):
             return
         if self._expert is None or self._rule is None:
             expert = make_expert(self._expert_argument, self.env)
-            self._rule = make_rule(self._rule_in_force, self.env, expert)
+            rule, rule_kwargs = self._rule_in_force
+            self._rule = make_rule(rule, self.env, expert, rule_kwargs)
             self._expert = expert
         if self._budget_is_spent():
             self._on("pause")
@@ -154,12 +159,12 @@ class InterventionWrapper(gym.Wrapper, RecordConstructorArgs):
         :param rule: see ``make_rule``; None for the rule that the wrapper was made with
         :raises ValueError: for a rule that does not fit; nothing is changed then
         """
-        rule = self._rule_argument if rule is None else rule
-        check_rule(rule, self._expert_argument)
+        rule, rule_kwargs = in_force = self._rule_arguments if rule is None else (rule, None)
+        check_rule(rule, self._expert_argument, rule_kwargs)
         if self._expert is not None:
-            self._rule = make_rule(rule, self.env, self._expert)
+            self._rule = make_rule(rule, self.env, self._expert, rule_kwargs)
             self._rule.reset()
-        self._rule_in_force = rule
+        self._rule_in_force = in_force
 
     def pause(self) -> None:
         """
@@ -325,7 +330,7 @@ class InterventionWrapper(gym.Wrapper, RecordConstructorArgs):
         assert self._rule is not None
         takeover = self._rule(observation, novice_action, expert_action, was_driving)
         if not isinstance(takeover, bool | np.bool_):
-            raise TypeError(f"rule must return True or False, got {takeover!r} from {self._rule_in_force!r}.")
+            raise TypeError(f"rule must return True or False, got {takeover!r} from {self._rule_in_force[0]!r}.")
         return bool(takeover)
 
     def _checked_novice_action(self, action: Any) -> np.ndarray:

@@ -164,21 +164,20 @@ def scale_action(action: np.ndarray, action_space: spaces.Box) -> np.ndarray:
     return 2 * (np.asarray(action, dtype=np.float64) - low) / (high - low) - 1
 
 
-def make_rule(rule: Any, env: gym.Env, expert: Any) -> TakeoverRule:
+def make_rule(rule: Any, env: gym.Env, expert: Any, rule_kwargs: dict[str, Any] | None = None) -> TakeoverRule:
     """
     :param rule: "risk" (``RiskRule`` with the expert's predictor), "disagreement" (``DisagreementRule`` with threshold 0.3),
         "always", "never", a ``TakeoverRule`` (of a ``RiskRule`` each environment gets its own copy), or a function
         (observation, novice action, expert action) -> bool
     :param env: the environment, for its action space
     :param expert: the expert of the environment, from ``make_expert``
+    :param rule_kwargs: of "risk" (e.g. take_over_below) or "disagreement" (threshold)
     :return: the rule
     :raises ValueError: for anything else, and for "risk" if the expert has no ``time_to_trouble``
     """
-    check_rule(rule, expert)
-    if rule == "risk":
-        return RiskRule(expert.time_to_trouble)
-    if rule == "disagreement":
-        return DisagreementRule(0.3, env.action_space)  # type: ignore[arg-type]
+    check_rule(rule, expert, rule_kwargs)
+    if isinstance(rule, str) and rule in CONFIGURABLE:
+        return CONFIGURABLE[rule](getattr(expert, "time_to_trouble", None), env.action_space, **(rule_kwargs or {}))
     if isinstance(rule, RiskRule):
         return copy.copy(rule)
     if isinstance(rule, TakeoverRule):
@@ -186,12 +185,20 @@ def make_rule(rule: Any, env: gym.Env, expert: Any) -> TakeoverRule:
     return FunctionRule({"always": always, "never": never}[rule] if isinstance(rule, str) else rule)
 
 
-def check_rule(rule: Any, expert: Any) -> None:
+# Rules that take rule_kwargs: name -> (time_to_trouble, action space, rule_kwargs) -> rule
+CONFIGURABLE: dict[str, Callable[..., TakeoverRule]] = {
+    "risk": lambda time_to_trouble, action_space, **kwargs: RiskRule(time_to_trouble, **kwargs),
+    "disagreement": lambda time_to_trouble, action_space, threshold=0.3: DisagreementRule(threshold, action_space),
+}
+
+
+def check_rule(rule: Any, expert: Any, rule_kwargs: dict[str, Any] | None = None) -> None:
     """
     What can be checked without building anything: the predictor of a scripted driver that is still a name is not.
 
     :param rule: see ``make_rule``
     :param expert: see ``make_expert``
+    :param rule_kwargs: see ``make_rule``
     :raises ValueError: see ``make_rule``
     """
     if isinstance(rule, type) or not (callable(rule) or (isinstance(rule, str) and rule in RULE_NAMES)):
@@ -204,3 +211,10 @@ def check_rule(rule: Any, expert: Any) -> None:
             "rule: 'risk' needs an expert that predicts trouble (a method time_to_trouble), and this one has none. Pass "
             "rule=RiskRule(time_to_trouble=...), a function (observation, action) -> seconds, or rule='disagreement'."
         )
+    if rule_kwargs:
+        if not isinstance(rule, str) or rule not in CONFIGURABLE:
+            raise ValueError(f"rule_kwargs: only {' and '.join(map(repr, CONFIGURABLE))} take any, got rule={rule!r}.")
+        try:  # on anything
+            CONFIGURABLE[rule](len, spaces.Box(-1.0, 1.0), **rule_kwargs)
+        except TypeError as error:
+            raise ValueError(f"rule_kwargs: {rule_kwargs} do not fit rule={rule!r}: {error}.") from None
