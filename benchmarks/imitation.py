@@ -4,9 +4,9 @@
     python benchmarks/imitation.py gail --jobs 2     # experts (PPO, SAC), their demonstrations, GAIL; runs what is missing
     python benchmarks/imitation.py report            # tables of both from the CSVs
 
-Hyperparameters of ``rounds`` are those of ``hyperparams/<algo>.yml``; after the warm-up and after each round, one deterministic
-episode on each of the maps 1000-1049, without the human. One CSV per run in benchmarks/results/imitation/, a row per evaluation
-as it comes; a run that was cut off starts anew. Experts and demonstrations go to --work (not committed).
+Hyperparameters of ``rounds`` are those of ``hyperparams/<algo>.yml``; after the warm-up and after each round, one
+deterministic episode on each of the maps 1000-1049, without the human. One CSV per run in benchmarks/results/imitation/, a
+row per evaluation as it comes; a run that was cut off starts anew. The experts of ``gail`` go to --work (not committed).
 """
 
 import argparse
@@ -216,9 +216,8 @@ def report(args: argparse.Namespace) -> None:
         values = [float(row[key]) for row in rows]
         return f"{np.mean(values):.{digits}f}" + (f" ± {np.std(values, ddof=1):.{digits}f}" if len(values) > 1 else "")
 
-    print(
-        "| method | seeds | after round | human steps | all steps | success | cost | return |\n|---|---|---|---|---|---|---|---|"
-    )
+    print("| method | seeds | after round | human steps | all steps | success | cost | return |")
+    print("|---" * 8 + "|")
     for algo in ("hg_dagger", "iwr"):
         runs = [run for seed in args.seeds if len(run := read(RESULTS / f"{algo}-{seed}.csv")) == N_ROUNDS + 1]
         for number, rows in enumerate(zip(*runs, strict=True)):
