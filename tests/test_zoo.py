@@ -38,10 +38,12 @@ def test_train_leaves_what_the_zoo_promises(trained):
     assert dict(saved)["learning_rate"] == 0.001  # ours, not the zoo's default
 
 
-@pytest.mark.parametrize("algo", ["dsac", "pvp", "dpvp", "chac", "sac", "ppo", "sac_lag", "ppo_lag"])
+@pytest.mark.parametrize("algo", ["dsac", "pvp", "dpvp", "chac", "sac", "ppo", "sac_lag", "ppo_lag", "hg_dagger", "iwr"])
 def test_our_environment(tmp_path, algo):
     few_steps = ["-params", "n_steps:64", "batch_size:64"]
-    few = {"ppo": few_steps, "ppo_lag": few_steps, "chac": ["-params", "switch_after:100", "prefit_steps:5"]}.get(algo, [])
+    few_rounds = ["-params", "warm_up_steps:60", "round_human_steps:20"]
+    stages = ["-params", "switch_after:100", "prefit_steps:5"]
+    few = {"ppo": few_steps, "ppo_lag": few_steps, "hg_dagger": few_rounds, "iwr": few_rounds, "chac": stages}.get(algo, [])
     quick = ["--env", "SafeDrive-v0", "-n", "200", "--eval-freq", "100", "--eval-episodes", "1", "-f", "logs"]
     output = run(ZOO, "train", "--algo", algo, *quick, *few, "--env-kwargs", "horizon:60", "blocks:2", cwd=tmp_path)
     assert str(hyperparams_file(algo)) in output and "Saving to" in output
@@ -280,8 +282,9 @@ def test_demonstrations_are_recorded_and_learned_from(tmp_path):
         "1",
     ]
     run(sys.executable, "-m", "sb3_chac", *command, cwd=tmp_path, env=folder)
-    for algo in ("bc", "cql"):
-        run(ZOO, "train", "--algo", algo, *quick, cwd=tmp_path, env=folder)
+    for algo in ("bc", "cql", "gail"):
+        params = ["-params", "n_envs:1", "n_steps:30", "batch_size:30"] if algo == "gail" else []
+        run(ZOO, "train", "--algo", algo, *quick, *params, cwd=tmp_path, env=folder)
         (model,) = (tmp_path / "logs" / algo).glob("*/SafeDrive-v0.zip")
         options = ["--scenarios", "1000", "--env-kwargs", "horizon:30"]
         assert "safety cost" in run(sys.executable, "-m", "sb3_chac", "evaluate", model, *options, cwd=tmp_path)
