@@ -125,7 +125,9 @@ class Record(BaseCallback):
         return True
 
 
-def run(name: str, seed: int, every: int, results: Path, models: Path, env_id: str = "SafeDrive-v0") -> str:
+def run(
+    name: str, seed: int, every: int, results: Path, models: Path, env_id: str = "SafeDrive-v0", most_steps: int = 200_000
+) -> str:
     th.set_num_threads(1)
     method = METHODS[name]
     path = results / f"{name}-{seed}.csv"
@@ -141,7 +143,9 @@ def run(name: str, seed: int, every: int, results: Path, models: Path, env_id: s
         training_cost = model.counts["safety_cost"]
     maps = TUNING_MAPS if seed >= FIRST_TUNING_SEED else TEST_MAPS
     record = Record(path, {"method": name, "seed": seed}, env_id, every, maps, training_cost)
-    model.learn(method.steps - model.num_timesteps, callback=record, reset_num_timesteps=method.goes_on_from is None)
+    model.learn(
+        min(method.steps, most_steps) - model.num_timesteps, callback=record, reset_num_timesteps=method.goes_on_from is None
+    )
     model.save(models / f"{name}-{seed}.zip")
     if any(other.goes_on_from == name for other in METHODS.values()):
         model.save_replay_buffer(models / f"{name}-{seed}.pkl")
@@ -154,8 +158,8 @@ def read(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def is_finished(path: Path, method: Method) -> bool:
-    return path.exists() and int(read(path)[-1]["step"]) >= method.steps
+def is_finished(path: Path, method: Method, most_steps: int) -> bool:
+    return path.exists() and int(read(path)[-1]["step"]) >= min(method.steps, most_steps)
 
 
 def run_all(args: argparse.Namespace) -> None:
@@ -165,13 +169,14 @@ def run_all(args: argparse.Namespace) -> None:
             for seed in args.seeds
             for name in args.methods
             if (METHODS[name].goes_on_from is not None) == go_on
-            and not is_finished(args.results / f"{name}-{seed}.csv", METHODS[name])
+            and not is_finished(args.results / f"{name}-{seed}.csv", METHODS[name], args.steps)
         ]
 
     context = multiprocessing.get_context("spawn")
     for go_on in (False, True):  # from what the first round leaves
         with ProcessPoolExecutor(args.jobs, mp_context=context, max_tasks_per_child=1) as pool:
-            futures = [pool.submit(run, *job, args.every, args.results, args.models, args.env) for job in missing(go_on)]
+            arguments = (args.every, args.results, args.models, args.env, args.steps)
+            futures = [pool.submit(run, *job, *arguments) for job in missing(go_on)]
             for future in as_completed(futures):
                 print(future.result(), flush=True)
 
@@ -197,19 +202,20 @@ def report(args: argparse.Namespace) -> None:
     rows = []
     for name, method in METHODS.items():
         paths = [args.results / f"{name}-{seed}.csv" for seed in args.seeds]
-        runs = [read(path) for path in paths if is_finished(path, method)]
+        runs = [read(path) for path in paths if is_finished(path, method, args.steps)]
         if not runs:
             continue
+        runs = [rows[: min(map(len, runs))] for rows in runs]
         scores = {key: columns(runs, key)[:, -3:].mean(axis=1) for key in titles}
         scores |= {key: columns(runs, key)[:, -1] for key in ("human_steps", "training_cost")}
         text = {key: f"{s.mean():.2f}" + (f" ± {s.std(ddof=1):.2f}" if len(s) > 1 else "") for key, s in scores.items()}
         whole = {key: f"{scores[key].mean():.0f}" for key in ("human_steps", "training_cost")}
+        steps = columns(runs, "step")[0]
         print(
-            f"| {method.title} | {len(runs)} | {method.steps // 1000}K | {whole['human_steps']} | {text['return_mean']} "
+            f"| {method.title} | {len(runs)} | {steps[-1] / 1000:.0f}K | {whole['human_steps']} | {text['return_mean']} "
             f"| {text['cost_mean']} | {text['success_rate']} | {whole['training_cost']} |"
         )
         rows.append({"method": name, "seeds": len(runs), **{key: float(s.mean()) for key, s in scores.items()}})
-        steps = columns(runs, "step")[0]
         for axis, key in zip(axes, [*titles, "training_cost"], strict=True):
             curves = columns(runs, key)
             (line,) = axis.plot(steps, curves.mean(axis=0), label=method.title)
@@ -235,7 +241,7 @@ def report_switch(args: argparse.Namespace) -> list[dict[str, Any]]:
         drops = []
         for seed in args.seeds:
             before, after = args.results / f"{method.goes_on_from}-{seed}.csv", args.results / f"{name}-{seed}.csv"
-            if not is_finished(after, method):
+            if not is_finished(after, method, args.steps):
                 continue
             start, after_switch = read(before)[-1], [row for row in read(after) if int(row["step"]) <= 2 * SWITCH]
             lowest = min(float(row["return_mean"]) for row in after_switch)
@@ -300,7 +306,7 @@ def agents(args: argparse.Namespace) -> None:
     folder = HERE / "agents"
     folder.mkdir(exist_ok=True)
     for name, networks in ACTING.items():
-        seeds = [seed for seed in args.seeds if is_finished(args.results / f"{name}-{seed}.csv", METHODS[name])]
+        seeds = [seed for seed in args.seeds if is_finished(args.results / f"{name}-{seed}.csv", METHODS[name], args.steps)]
         if seeds:
             seeds.sort(key=lambda seed: float(read(args.results / f"{name}-{seed}.csv")[-1]["return_mean"]))
             chosen = seeds[(len(seeds) - 1) // 2]
@@ -331,6 +337,7 @@ if __name__ == "__main__":
     parser.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS))
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
     parser.add_argument("--every", type=int, default=10_000, help="steps between evaluations")
+    parser.add_argument("--steps", type=int, default=200_000, help="most steps of a run, to stop the long ones earlier")
     parser.add_argument("--jobs", type=int, default=2, help="processes at once, one torch thread each")
     parser.add_argument("--env", choices=RESULTS, default="SafeDrive-v0")
     parser.add_argument("--results", type=Path, help="default: see above")
