@@ -93,7 +93,7 @@ def drive_some(preset: str, name: str, scenarios: list[int]) -> list[dict]:
 def drivers(args: argparse.Namespace) -> None:
     there = {(row["preset"], row["driver"], int(row["scenario"])) for row in read()}
     tasks = []
-    for name, preset in product(DRIVERS, PRESETS):
+    for name, preset in product(args.drivers, PRESETS):
         missing = [scenario for scenario in DRIVER_MAPS if (preset, name, scenario) not in there]
         tasks += [(preset, name, missing[i : i + CHUNK]) for i in range(0, len(missing), CHUNK)]
     context = multiprocessing.get_context("spawn")
@@ -139,6 +139,7 @@ if __name__ == "__main__":
     commands = {f.__name__: f for f in (drivers, report, observations)}
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("command", choices=commands)
+    parser.add_argument("--drivers", nargs="+", choices=DRIVERS, default=list(DRIVERS))
     parser.add_argument("--jobs", type=int, default=2, help="processes at once, one torch thread each")
     arguments = parser.parse_args()
     commands[arguments.command](arguments)

@@ -99,6 +99,26 @@ def test_standing_although_the_road_is_free_is_trouble(env):
     assert driver.time_to_trouble(None, np.array([0.0, 1.0])) == 0.0
 
 
+def test_goes_on_beside_something_that_it_touches(env):
+    """It used to wait there for eight seconds."""
+    driver = env.scripted_driver("scripted-ideal")
+    drive(env, driver, 3002, steps=2)  # it has hardly begun to move
+    things = env.simulator.engine.get_objects(lambda thing: isinstance(thing, TrafficObject))
+    thing = next(iter(things.values()))
+    ahead = np.asarray(env.ego.heading)
+    left = np.array([-ahead[1], ahead[0]])
+    for distance, beside, expected in [(0.0, 1.5, True), (-1.0, -1.5, True), (0.0, 4.0, False), (3.0, 0.0, False)]:
+        thing.set_position(env.position + distance * ahead + beside * left)
+        driver._locate()
+        others = driver._look(np.array([0.1, 0.2]))
+        nearest = np.argmin(np.linalg.norm(others.positions[:, 0] - np.asarray(thing.position), axis=1))
+        assert driver._beside(others)[nearest] == expected
+    thing.set_position(env.position + 1.3 * left)
+    for _ in range(20):
+        env.step(driver())
+    assert env.forward_speed > 2.0
+
+
 def test_drives_from_wherever_it_is(env):
     driver = env.scripted_driver("scripted")
     rng = np.random.default_rng(0)
