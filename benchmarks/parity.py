@@ -2,12 +2,14 @@
 
     python benchmarks/parity.py data                  # SAC learns; what it saw, and what it does in the end, are the datasets
     python benchmarks/parity.py ours                  # BC on the last 4,000 steps, CQL on all 10,000, seeds 0-2
+    python benchmarks/parity.py ours-mean-target --algos cql    # CQL with d3rlpy's targets
     python -m venv d3rlpy-venv; d3rlpy-venv/bin/pip install torch==2.13.0 d3rlpy==2.8.1
     d3rlpy-venv/bin/python benchmarks/parity.py d3rlpy    # the same with d3rlpy, which cannot be installed beside us
     python benchmarks/parity.py report
 
-d3rlpy has no 1/2 before the temporal difference, so that its conservative weight of 5 is 2.5 here. Rows are appended to
-benchmarks/results/parity.csv; the datasets are committed beside it.
+In d3rlpy the target of Q takes the actor's mean action, in the paper and here a sampled one. d3rlpy has no 1/2 before the
+temporal difference, so that its conservative weight of 5 is 2.5 here. Rows are appended to benchmarks/results/parity/parity.csv;
+the datasets are committed beside it.
 """
 
 import argparse
@@ -81,11 +83,22 @@ def save(library: str, algo: str, seed: int, score: float, start: float) -> None
         writer.writerow(row)
 
 
-def ours(algo: str, seed: int, columns: dict[str, np.ndarray]) -> float:
+def ours_mean_target(algo: str, seed: int, columns: dict[str, np.ndarray]) -> float:
+    return ours(algo, seed, columns, mean_target=True)
+
+
+def ours(algo: str, seed: int, columns: dict[str, np.ndarray], mean_target: bool = False) -> float:
     import torch as th
 
     from sb3_chac import BC, CQL
+    from sb3_chac.common.offline import Batch
     from sb3_chac.human.demonstrations import Demonstrations
+
+    class MeanTargetCQL(CQL):
+        def _q_targets(self, batch: Batch, ent_coef: th.Tensor) -> th.Tensor:
+            actions = self.actor(batch.next_observations, deterministic=True)
+            next_q = th.cat(self.critic_target(batch.next_observations, actions), dim=1).min(dim=1).values
+            return batch.rewards + self.gamma * (1 - batch.dones) * next_q
 
     th.set_num_threads(1)
     env = gym.make(ENV)
@@ -104,7 +117,7 @@ def ours(algo: str, seed: int, columns: dict[str, np.ndarray]) -> float:
     if algo == "bc":
         model = BC("MlpPolicy", env, dataset, learning_rate=BC_RATE, validation_share=0.0, **common).learn(BC_STEPS)
     else:
-        model = CQL(
+        model = (MeanTargetCQL if mean_target else CQL)(
             "MlpPolicy",
             env,
             dataset,
@@ -158,20 +171,24 @@ def d3rlpy(algo: str, seed: int, columns: dict[str, np.ndarray]) -> float:
 def report() -> None:
     with (RESULTS / "parity.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
-    print("| algorithm | dataset (mean return of an episode) | ours | d3rlpy 2.8.1 |\n|---|---|---|---|")
+    print(
+        "| algorithm | dataset (mean return of an episode) | ours | ours, target as d3rlpy | d3rlpy 2.8.1 |\n|---|---|---|---|---|"
+    )
     for algo, name in DATASETS.items():
         columns = np.load(RESULTS / f"{name}.npz")
         cells = []
-        for library in ("ours", "d3rlpy"):
+        for library in LIBRARIES:
             scores = [float(row["return"]) for row in rows if (row["library"], row["algo"]) == (library, algo)]
-            cells.append(f"{np.mean(scores):.0f} ± {np.std(scores, ddof=1):.0f} ({len(scores)} seeds)")
+            cells.append(f"{np.mean(scores):.0f} ± {np.std(scores, ddof=1):.0f} ({len(scores)} seeds)" if scores else "")
         mean = columns["rewards"].sum() / columns["ends"].sum()
         print(f"| {algo.upper()} | {name} ({mean:.0f}) | " + " | ".join(cells) + " |")
 
 
+LIBRARIES = {"ours": ours, "ours-mean-target": ours_mean_target, "d3rlpy": d3rlpy}
+
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("command", choices=["data", "ours", "d3rlpy", "report"])
+    parser.add_argument("command", choices=["data", *LIBRARIES, "report"])
     parser.add_argument("--algos", nargs="+", choices=DATASETS, default=list(DATASETS))
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
     args = parser.parse_args()
@@ -182,5 +199,5 @@ if __name__ == "__main__":
             for seed in args.seeds:
                 start = time.process_time()
                 columns = dict(np.load(RESULTS / f"{DATASETS[algo]}.npz"))
-                score = {"ours": ours, "d3rlpy": d3rlpy}[args.command](algo, seed, columns)
+                score = LIBRARIES[args.command](algo, seed, columns)
                 save(args.command, algo, seed, score, start)
