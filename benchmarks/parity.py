@@ -8,8 +8,8 @@
     python benchmarks/parity.py report
 
 In d3rlpy the target of Q takes the actor's mean action, in the paper and here a sampled one. d3rlpy has no 1/2 before the
-temporal difference, so that its conservative weight of 5 is 2.5 here. Rows are appended to benchmarks/results/parity/parity.csv;
-the datasets are committed beside it.
+temporal difference, so that its conservative weight of 5 is 2.5 here. Rows are appended to
+benchmarks/results/parity/parity.csv; the datasets are committed beside it.
 """
 
 import argparse
@@ -171,9 +171,8 @@ def d3rlpy(algo: str, seed: int, columns: dict[str, np.ndarray]) -> float:
 def report() -> None:
     with (RESULTS / "parity.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
-    print(
-        "| algorithm | dataset (mean return of an episode) | ours | ours, target as d3rlpy | d3rlpy 2.8.1 |\n|---|---|---|---|---|"
-    )
+    print("| algorithm | dataset (mean return of an episode) | ours | ours, target as d3rlpy | d3rlpy 2.8.1 |")
+    print("|---" * 5 + "|")
     for algo, name in DATASETS.items():
         columns = np.load(RESULTS / f"{name}.npz")
         cells = []
