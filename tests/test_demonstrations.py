@@ -368,12 +368,14 @@ def test_interrupted(datasets, capsys, monkeypatch, number, code):
     original, original_step = toy_env.ToyDrive.reset, toy_env.ToyDrive.step
     monkeypatch.setattr(toy_env.ToyDrive, "reset", reset)
     monkeypatch.setattr(toy_env.ToyDrive, "step", step)
+    ours = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
     handlers = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
     with pytest.raises(SystemExit) as exit_code:
         command(["record", "--expert", "scripted", "--env", TOY, "--dataset", "toy/half-v0", "--jobs", "1"])
     assert exit_code.value.code == code and len(seeds) == 3
     assert not datasets.exists() and not list(datasets.parent.glob(".recording-*"))
     assert handlers == [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
+    signal.signal(signal.SIGINT, ours)
 
 
 def test_commands(datasets, tmp_path):
