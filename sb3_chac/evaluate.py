@@ -2,6 +2,7 @@
 
 import argparse
 import ast
+import csv
 import inspect
 import json
 import os
@@ -77,6 +78,7 @@ def make_parser() -> argparse.ArgumentParser:
     )
     what = parser.add_argument_group("what is written, besides the table")
     what.add_argument("--json", type=Path, metavar="FILE", help="summary, settings, versions and one record per episode")
+    what.add_argument("--steps", type=Path, metavar="FILE.csv", help="a row per step: position, action, whether cost arose")
     what.add_argument("--plot", type=Path, metavar="FILE.png", help="the driven paths on the map, up to 12 scenarios")
     what.add_argument("--video", type=Path, metavar="FILE", help=".mp4 or .gif of one episode")
     what.add_argument("--video-scenario", type=int, metavar="K", help="scenario (or episode) to film (default: the first)")
@@ -109,6 +111,7 @@ def run(args: argparse.Namespace) -> None:
     """
     args.env = args.env or env_of(args.model)
     check_output("--json", args.json)
+    check_output("--steps", args.steps, (".csv",))
     check_output("--plot", args.plot, pictures.PLOT_SUFFIXES)
     check_output("--video", args.video, pictures.VIDEO_SUFFIXES)
     for option, low in [("seed", 0), ("jobs", 1), ("episodes", 1)]:
@@ -134,10 +137,12 @@ def run(args: argparse.Namespace) -> None:
         who = {"model": str(path), "algo": algo}
 
     task = Task(policy, args.env, env_kwargs, normalize, args.seed, args.episodes is None)
-    if args.plot or args.video:
+    if args.plot or args.steps or args.video:
         with Runner(task) as runner:
+            if args.steps:
+                pictures.check_has(runner, numbers[0], "position")
             if args.plot:
-                pictures.check_can_plot(runner, numbers[0])
+                pictures.check_has(runner, numbers[0], "position", "plot_map")
             if args.video:
                 pictures.check_can_render(runner)
     for other in others.values():
@@ -157,22 +162,52 @@ def run(args: argparse.Namespace) -> None:
             progress_bar=True,
         )
 
-    evaluation = assess(policy, record_paths=args.plot is not None)
+    evaluation = assess(policy, record_paths=bool(args.plot or args.steps))
     evaluation.settings |= who
     beside = {name: assess(other) for name, other in others.items()}
     if beside:
         evaluation.settings["beside"] = {name: other.to_dict() for name, other in beside.items()}
     print(compare([evaluation, *beside.values()]) if beside else evaluation.table())
+    write_files(args, evaluation, task, filmed)
+
+
+def write_files(args: argparse.Namespace, evaluation: Evaluation, task: Task, filmed: int) -> None:
+    """
+    :param args: which files
+    :param evaluation: what goes into them
+    :param task: what was evaluated
+    :param filmed: scenario (or episode) of the video
+    """
     if args.json:
         args.json.write_text(evaluation.to_json() + "\n")
+    if args.steps:
+        write_steps(args.steps, evaluation)
     if args.plot:
         with Runner(task) as runner:
             pictures.save_plot(args.plot, runner, evaluation)
     if args.video:
         with Runner(task, render_mode="rgb_array") as runner:
             pictures.save_video(args.video, runner, filmed)
-    for file in filter(None, (args.json, args.plot, args.video)):
+    for file in filter(None, (args.json, args.steps, args.plot, args.video)):
         print(f"Saved {file}")
+
+
+def write_steps(file: Path, evaluation: Evaluation) -> None:
+    """
+    :param file: CSV, gets a row for each step: scenario (or episode), step, x and y [m] before it, the action, and cost: 1 if
+        any arose in it
+    :param evaluation: made with ``record_paths=True``
+    """
+    with file.open("w", newline="") as lines:
+        writer = csv.writer(lines)
+        for record, path in zip(evaluation.records, evaluation.paths, strict=True):
+            actions = path.actions.reshape(len(path.actions), -1)
+            if lines.tell() == 0:
+                names = [f"action_{i}" for i in range(actions.shape[1])]
+                writer.writerow(["scenario" if "scenario" in record else "episode", "step", "x", "y", *names, "cost"])
+            for step, (position, action, costly) in enumerate(zip(path.positions, actions, path.costly[1:], strict=False)):
+                number = record.get("scenario", record.get("episode"))
+                writer.writerow([number, step, *position.round(3), *action.round(4), int(costly)])
 
 
 def env_of(model: Path | None) -> str:

@@ -62,6 +62,22 @@ class GuidedProgressBar(ProgressBarCallback):
         return ", ".join([*parts, f"cost {counts['safety_cost']:g}"])
 
 
+class SafetyCost(BaseCallback):
+    """
+    Sums up the safety cost (``info["cost"]``, 0 where there is none) of a training whose algorithm does not, as
+    ``safety/safety_cost`` of the logger and ``model.safety_cost``, which is saved with the model.
+    """
+
+    def _on_training_start(self) -> None:
+        if self.model.num_timesteps == 0 or not hasattr(self.model, "safety_cost"):
+            self.model.safety_cost = 0.0  # type: ignore[attr-defined]
+
+    def _on_step(self) -> bool:
+        self.model.safety_cost += sum(float(info.get("cost", 0.0)) for info in self.locals["infos"])  # type: ignore[attr-defined]
+        self.logger.record("safety/safety_cost", self.model.safety_cost)  # type: ignore[attr-defined]
+        return True
+
+
 class CSVProgress(BaseCallback):
     """
     Also writes what the logger gets as CSV, a row each time it is dumped. It adds rows when the training starts and ends and
@@ -103,4 +119,6 @@ class CSVProgress(BaseCallback):
         if isinstance(self.model, GuidedOffPolicyAlgorithm):
             row["takeover/human_steps"] = self.model.counts["human_steps"]
             row["safety/safety_cost"] = self.model.counts["safety_cost"]
+        elif hasattr(self.model, "safety_cost"):
+            row["safety/safety_cost"] = self.model.safety_cost
         output.write(row, {})

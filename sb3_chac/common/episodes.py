@@ -30,10 +30,14 @@ class NotEvaluable(ValueError):
 
 
 class DrivenPath(NamedTuple):
-    """Where an episode went: ``positions`` [m] of shape (steps + 1, 2), ``costly`` of shape (steps + 1,): cost arose there."""
+    """
+    Where an episode went: ``positions`` [m] of shape (steps + 1, 2), ``costly`` of shape (steps + 1,): cost arose there, and
+    ``actions`` of shape (steps, *action_shape), in the units of the environment.
+    """
 
     positions: np.ndarray
     costly: np.ndarray
+    actions: np.ndarray
 
 
 def make_env(env: str | EnvSpec | Callable[..., gym.Env], env_kwargs: dict[str, Any]) -> gym.Env:
@@ -174,11 +178,12 @@ class Runner:
         """
         observation = self.reset(number)
         info: dict[str, Any] = {}
-        rewards, costs, positions = [0.0], [0.0], [self._position()]
+        rewards, costs, positions, actions = [0.0], [0.0], [self._position()], []
         terminated = truncated = False
         on_step()
         while not (terminated or truncated):
-            observation, reward, terminated, truncated, info = self.env.step(self.driver(observation))
+            actions.append(self.driver(observation))
+            observation, reward, terminated, truncated, info = self.env.step(actions[-1])
             rewards.append(float(reward))
             costs.append(float(info.get("cost", 0.0)))
             positions.append(self._position())
@@ -198,7 +203,9 @@ class Runner:
             if not math.isfinite(record.get(key, 0.0)):
                 raise ValueError(f"{key} of episode {number} of {self.env.unwrapped} is {record[key]}: mend the environment.")
         record |= {key: value for key, value in _scalars(info).items() if key not in {*record, "is_success"}}
-        return record, DrivenPath(np.array(positions), np.array(costs) > 0) if self.task.record_paths else None
+        if not self.task.record_paths:
+            return record, None
+        return record, DrivenPath(np.array(positions), np.array(costs) > 0, np.array(actions))
 
     def _position(self) -> np.ndarray | None:
         if not self.task.record_paths:

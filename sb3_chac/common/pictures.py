@@ -27,16 +27,17 @@ def check_can_render(runner: Runner) -> None:
         raise NotEvaluable(f"a video needs an environment with render_mode 'rgb_array', {runner.env.unwrapped} has {modes}.")
 
 
-def check_can_plot(runner: Runner, number: int) -> None:
+def check_has(runner: Runner, number: int, *names: str) -> None:
     """
     :param number: scenario, or episode if there are no scenarios, to start: environments may have no position before
-    :raises NotEvaluable: unless the environment can draw its map and say where the vehicle is
+    :param names: what the environment must have: "position" to say where the vehicle is, "plot_map" to draw its map
+    :raises NotEvaluable: unless it has
     """
     runner.reset(number)
-    missing = [name for name in ("position", "plot_map") if not hasattr(runner.env.unwrapped, name)]
+    missing = [name for name in names if not hasattr(runner.env.unwrapped, name)]
     if missing:
         raise NotEvaluable(
-            f"a plot needs an environment with position and plot_map(axes), {runner.env.unwrapped} lacks {missing}."
+            f"the driven paths need an environment with {' and '.join(names)}, {runner.env.unwrapped} lacks {missing}."
         )
 
 

@@ -10,12 +10,14 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+from rl_zoo3.utils import ALGOS
 from stable_baselines3.common.callbacks import ProgressBarCallback
 
-import sb3_chac
-from sb3_chac.common.callbacks import PROGRESS_FILE, CSVProgress, GuidedProgressBar
+from sb3_chac.common.callbacks import PROGRESS_FILE, CSVProgress, GuidedProgressBar, SafetyCost
 from sb3_chac.common.checkpoints import ResumableCheckpoint, checkpoint_step
 from sb3_chac.common.guided import GuidedOffPolicyAlgorithm
+from sb3_chac.common.lagrange import CostConstrainedAlgorithm
+from sb3_chac.common.offline import OfflineAlgorithm
 from sb3_chac.envs import ENVIRONMENTS, ONE_PER_PROCESS, VALIDATION
 from sb3_chac.zoo.registration import ALGORITHMS, hyperparams_file
 
@@ -55,11 +57,18 @@ def init(original: Callable[..., None], manager: Any, *args: Any, **kwargs: Any)
             arguments["config"] = str(hyperparams_file(algo))
     if arguments["env_id"] in ONE_PER_PROCESS:
         arguments["vec_env_type"] = "subproc"
-    done = checkpoint_step(arguments.get("trained_agent", "")) if algo in ALGORITHMS else None
+    done = checkpoint_step(arguments.get("trained_agent", ""))
     if done is not None:
         arguments["seed"] = (arguments.get("seed", 0) + done) % 2**32
     original(**arguments)
     manager.steps_done = done
+
+
+def is_ours(manager: Any) -> bool:
+    """
+    :return: whether the algorithm or the environment is one of this package
+    """
+    return manager.algo in ALGORITHMS or manager.env_name.gym_id in ENVIRONMENTS
 
 
 def preprocess_hyperparams(original: Callable[..., Any], manager: Any, hyperparams: dict[str, Any]) -> Any:
@@ -73,14 +82,19 @@ def preprocess_hyperparams(original: Callable[..., Any], manager: Any, hyperpara
 
 def create_callbacks(original: Callable[..., None], manager: Any) -> None:
     """
-    Our algorithms write progress.csv and, except with ``--save-freq 0``, checkpoints to resume from (neither in trials of
-    Optuna). The progress bar of those that learn from takeovers tells what the human does.
+    Our algorithms, and others in our environments, write progress.csv with the safety cost and, except with ``--save-freq 0``,
+    checkpoints to resume from (neither in trials of Optuna). The progress bar of those that learn from takeovers tells what
+    the human does.
     """
     save_freq = manager.save_freq  # it is changed
     original()
-    if manager.algo not in ALGORITHMS or manager.optimize_hyperparameters:
+    if not is_ours(manager) or manager.optimize_hyperparameters:
         return
-    if issubclass(getattr(sb3_chac, ALGORITHMS[manager.algo]), GuidedOffPolicyAlgorithm):
+    algorithm = ALGOS[manager.algo]
+    # Those count for themselves, or make no steps
+    if not issubclass(algorithm, GuidedOffPolicyAlgorithm | CostConstrainedAlgorithm | OfflineAlgorithm):
+        manager.callbacks.append(SafetyCost())
+    if issubclass(algorithm, GuidedOffPolicyAlgorithm):
         manager.callbacks[:] = [
             GuidedProgressBar() if type(callback) is ProgressBarCallback else callback for callback in manager.callbacks
         ]
@@ -93,7 +107,7 @@ def create_callbacks(original: Callable[..., None], manager: Any) -> None:
 def save_config(original: Callable[..., None], manager: Any, saved_hyperparams: dict[str, Any]) -> None:
     """The command line in a form that can be repeated, without what ``sb3-chac resume`` adds to it."""
     original(saved_hyperparams)
-    if manager.algo in ALGORITHMS:
+    if is_ours(manager):
         arguments = sys.argv[1:]
         if manager.steps_done is not None and arguments[-2:] == ["-i", manager.trained_agent]:
             del arguments[-2:]

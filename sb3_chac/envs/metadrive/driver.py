@@ -27,7 +27,7 @@ STEP = 0.02  # [s] of the physics, in each of which the brake takes its share of
 MAX_BRAKING = 9.0  # [m/s2]
 TRAFFIC_SPEED, TRAFFIC_ACCELERATION, TRAFFIC_BRAKING = 8.4, 1.5, 1.5  # [m/s], [m/s2] in what it may do
 COUNTER_STEERING = 5.0  # [m/s2] with which a vehicle is straightened out
-PATIENCE, BOXED_IN_FOR = 3.0, 8.0  # [s]
+PATIENCE, BOXED_IN_FOR = 1.5, 8.0  # [s]
 DAWDLING = 0.4  # of the speed that the road allows
 USUAL_SPEED = 10.0  # [m/s] unless the preset allows less
 
@@ -452,7 +452,8 @@ class ScriptedDriver:
 
     def _beside(self, others: Others) -> np.ndarray:
         """
-        :return: whether it stands and touches the ego, or nearly so, but not in front, shape (n,)
+        :return: whether it stands and touches the ego, or nearly so, but not in front, or is being passed: the tail that plans
+            swing out into it is only theirs. Shape (n,)
         """
         d, angle = others.positions[:, 0] - self.position, others.headings[:, 0] - self.heading
         cos, sin = np.cos(self.heading), np.sin(self.heading)
@@ -461,4 +462,5 @@ class ScriptedDriver:
         gap_along = np.abs(along) - self.length / 2 - half_length
         gap_across = np.abs(across) - self.width / 2 - half_width
         in_front = (along > 0.0) & (gap_across < 0.0)
-        return ~others.moves & (gap_along < 0.8) & (gap_across < 0.4) & ~in_front
+        reach = np.where(along > 0.0, 0.4, 1.0)
+        return ~others.moves & (gap_along < 0.8) & (gap_across < reach) & ~in_front
