@@ -262,14 +262,13 @@ def call(folder: Path, *arguments: Any) -> None:
 
 
 running: list[subprocess.Popen[bytes]] = []
-LIBC = ctypes.CDLL(None)
 PR_SET_PDEATHSIG = 1
 
 
 def end_with_parent() -> None:
     """Called in the new process: it is killed when the one that waits for it is (Linux; elsewhere it goes on to its end)."""
     if sys.platform == "linux":
-        LIBC.prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
 def stop_all() -> None:
