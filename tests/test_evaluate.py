@@ -1,5 +1,6 @@
 """``sb3-chac evaluate`` and ``sb3_chac.common.evaluation.evaluate``, on the environments of toy_env.py."""
 
+import csv
 import json
 import pickle
 import sys
@@ -59,12 +60,18 @@ def launch(folder: Path, *arguments: str | Path) -> str:
 
 def test_expert_from_the_command_line(tmp_path):
     files = ["--json", "result.json", "--plot", "paths.png", "--video", "drive.mp4", "--video-scenario", "4"]
+    files += ["--steps", "steps.csv"]
     options = ["--scenarios", "3,4:6", "--env-kwargs", "reward:2.0", "--jobs", "2", "--seed", "5"]
     output = launch(tmp_path, "--expert", "lazy", "--env", TOY, *options, *files)
     assert "success rate          0.667 ± 0.471" in output and "Saved drive.mp4" in output and "3/3" in output
 
     result = json.loads((tmp_path / "result.json").read_text())
     records = result.pop("records")
+    with (tmp_path / "steps.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert list(rows[0]) == ["scenario", "step", "x", "y", "action_0", "cost"]
+    assert [int(row["scenario"]) for row in rows] == [r["scenario"] for r in records for _ in range(r["steps"])]
+    assert [row["step"] for row in rows[:3]] == ["0", "1", "2"]
     versions = result.pop("versions")
     assert set(versions) == {"sb3_chac", "stable_baselines3", "torch", "gymnasium"} and all(versions.values())
     assert result == {
@@ -255,6 +262,7 @@ def test_malformed_scenarios(text):
         (["--expert", "scripted", "--json", "nowhere/x.json"], "the folder nowhere does not exist"),
         (["--expert", "scripted", "--json", "."], "cannot be written (Is a directory)"),
         (["--expert", "scripted", "--plot", "x.mp4"], "must end with .png"),
+        (["--expert", "scripted", "--steps", "x.txt"], "must end with .csv"),
         (["--expert", "scripted", "--video", "x.png"], "must end with .mp4 or .gif"),
         (["model.zip", "--env", "toy_env:StillDrive-v0", "--video", "x.mp4"], "render_mode 'rgb_array'"),
         (["model.zip", "--env", "toy_env:StillDrive-v0", "--plot", "x.png"], "lacks ['position', 'plot_map']"),

@@ -19,6 +19,8 @@ from stable_baselines3.common.save_util import load_from_pkl
 
 from sb3_chac import CHAC, DPVP, DSAC
 from sb3_chac.common.checkpoints import ResumableCheckpoint, SparseWriter, checkpoint_step, newest_checkpoint
+from sb3_chac.envs.safedrive import SafeDriveEnv
+from sb3_chac.plot import read_progress
 from sb3_chac.resume import main as resume
 from sb3_chac.resume import steps
 
@@ -207,6 +209,35 @@ def test_more_steps_with_other_environments_and_normalization(tmp_path, monkeypa
     checkpoint = Path("logs/dsac/Pendulum-v1_2/checkpoints/200")
     assert steps(checkpoint / "Pendulum-v1.zip") == (200, 200)
     assert load_from_pkl(checkpoint / "replay_buffer.pkl").pos == 100  # rows of two environments
+
+
+@pytest.mark.parametrize(
+    ("algo", "params"),
+    [
+        ("sac", ["learning_starts:50", "buffer_size:1000", "policy_kwargs:dict(net_arch=[8])"]),
+        ("ppo", ["n_envs:1", "n_steps:50", "batch_size:50", "policy_kwargs:dict(net_arch=[8])"]),
+    ],
+)
+def test_algorithms_of_sb3_in_our_environments_go_on_with_their_safety_cost(tmp_path, monkeypatch, algo, params):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(SafeDriveEnv, "step", with_cost(SafeDriveEnv.step))
+    command = ["--algo", algo, "--env", "SafeDrive-v0", "--eval-freq", "-1", "--save-freq", "100", "--seed", "1"]
+    zoo_train(monkeypatch, *command, "-n", "100", "-params", *params)
+    checkpoint = Path("logs", algo, "SafeDrive-v0_1", "checkpoints", "100", "SafeDrive-v0.zip")
+    zoo_train(monkeypatch, *command, "-n", "250", "-params", *params, "-i", str(checkpoint))
+    for number, start, end in [(1, 0, 100), (2, 100, 250)]:
+        costs = read_progress(Path("logs", algo, f"SafeDrive-v0_{number}", "progress.csv"))["safety/safety_cost"]
+        assert costs[[0, -1], :2].tolist() == [[start, 0.5 * start], [end, 0.5 * end]]
+
+
+def with_cost(step):
+    """Each step costs .5, so that the sum says how many were counted."""
+
+    def costly(self, action):
+        *rest, info = step(self, action)
+        return *rest, info | {"cost": 0.5}
+
+    return costly
 
 
 @pytest.mark.parametrize("options", [["--save-freq", "0"], ["-optimize"]])
