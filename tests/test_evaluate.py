@@ -136,7 +136,8 @@ def test_functions_as_policy_and_as_environment(tmp_path):
     evaluation = evaluate(full_throttle, toy_env.ToyDrive, "0:3", env_kwargs={"length": 3}, record_paths=True, jobs=2)
     assert [record["steps"] for record in evaluation.records] == [3, 4, 5]
     assert evaluation.settings["policy"] == "full_throttle" and evaluation.settings["env"] == "ToyDrive"
-    positions, costly = evaluation.paths[0]
+    positions, costly, actions = evaluation.paths[0]
+    assert actions.tolist() == [[1.0]] * 3
     np.testing.assert_allclose(positions, [[0, 0], [1, 0.1], [2, 0.2], [3, 0.3]])
     assert costly.tolist() == [False, False, True, False]
     assert evaluate(lambda _: np.zeros(1, np.float32), TOY, "0").summary()["success_rate"] == 0.0
