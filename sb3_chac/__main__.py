@@ -6,12 +6,13 @@ RL-Zoo3's are for places where the stock ``rl_zoo3`` command does not find them 
 import sys
 from importlib import import_module
 
-OWN_COMMANDS = ("evaluate", "resume", "plot", "demos")  # a module each
+OWN_COMMANDS = ("drive", "evaluate", "resume", "plot", "demos")  # a module each
 COMMANDS = ("train", "enjoy", "plot_train", "plot_from_file", "all_plots", *OWN_COMMANDS)
 
 USAGE = f"""usage: sb3-chac {{{",".join(COMMANDS)}}} ...
 
 RL-Zoo3's commands with the algorithms of sb3_chac, and
+  drive                 train with yourself as the human: window or browser; keyboard, gamepad or steering wheel
   evaluate MODEL.zip    a model or an expert on held-out scenarios
   resume RUN_FOLDER     go on with a training that was interrupted or killed, from its newest checkpoint
   plot RUN_FOLDER       its curves: return, success rate, safety cost, what the human drove

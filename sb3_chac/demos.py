@@ -194,7 +194,7 @@ def describe(dataset: str | os.PathLike[str]) -> str:
     add("actions", shortened(demonstrations.action_space))
     add("environment", f"{spec.id} {spec.kwargs or ''}".rstrip() if spec else "not known")
     add("policy", metadata.get("algorithm_name", "not known"))
-    if settings:
+    if settings.get("seed") is not None:
         add("recorded with", f"seed {settings['seed']}, scenarios {as_range(settings['scenarios'])}")
     versions = {"minari": opened.minari_version, **settings.get("versions", {})}
     add("versions", ", ".join(f"{name} {version}" for name, version in versions.items()))

@@ -5,6 +5,7 @@ import json
 import shlex
 import sys
 import zipfile
+from importlib import import_module
 from pathlib import Path
 
 from sb3_chac.common.checkpoints import FOLDER, newest_checkpoint
@@ -43,6 +44,10 @@ def main(arguments: list[str]) -> None:
         parser.exit(2, f"{parser.prog}: error: {error}\n")
     if done >= total:
         print(f"{run_folder}: nothing remains to be done, all {total} steps were made.")
+        return
+
+    if command[:1] == ["drive"]:
+        import_module("sb3_chac.drive").main(["--resume", str(run_folder)])
         return
 
     register()

@@ -1,6 +1,7 @@
 """What the algorithms that learn from takeovers share: asking the human, storing who drove, counting."""
 
 import io
+import os
 import pathlib
 import warnings
 from collections import deque
@@ -15,6 +16,7 @@ from stable_baselines3.common.utils import safe_mean
 
 from sb3_chac.common.buffers import DualReplayBuffer
 from sb3_chac.common.off_policy_algorithm import CheckedOffPolicyAlgorithm
+from sb3_chac.human.demonstrations import Demonstrations, load_demonstrations
 
 SelfGuided = TypeVar("SelfGuided", bound="GuidedOffPolicyAlgorithm")
 
@@ -61,6 +63,37 @@ class GuidedOffPolicyAlgorithm(CheckedOffPolicyAlgorithm):
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", message="`n_steps=")  # the dual buffer gets it, just above
             super()._setup_model()
+
+    def store_demonstrations(self, dataset: str | os.PathLike[str] | Demonstrations) -> None:
+        """
+        Puts a dataset into the replay buffer, as if it had been driven: what the human drove (all of it, if the dataset does not
+        say who drove) beside what the novice proposed, and the rest. It is not counted as steps of this training.
+
+        :param dataset: id or folder of a dataset of Minari, or Demonstrations
+        :raises DatasetError: if it is missing, damaged or does not fit
+        """
+        data = load_demonstrations(dataset, self.observation_space, self.action_space)
+
+        def scaled(actions: np.ndarray) -> np.ndarray:
+            return self.policy.scale_action(actions).reshape(len(data), -1)
+
+        actions = scaled(data.actions)
+        novice_actions = actions if data.novice_actions is None else scaled(data.novice_actions)
+        takeovers = np.ones(len(data), dtype=bool) if data.takeovers is None else data.takeovers
+        begins_episode = np.diff(data.episodes, prepend=-1) != 0
+        starts = takeovers & (begins_episode | ~np.roll(takeovers, 1))
+        dones = data.terminations | data.truncations
+        columns = (data.observations, data.next_observations, actions, data.rewards, dones)
+        for i in range(len(data)):
+            info = {
+                "takeover": bool(takeovers[i]),
+                "takeover_start": bool(starts[i]),
+                "novice_action": novice_actions[i],
+                "TimeLimit.truncated": bool(data.truncations[i]),
+            }
+            obs, next_obs, action, reward, done = (column[i : i + 1] for column in columns)
+            self.replay_buffer.add(obs, next_obs, action, reward, done, [info])
+        self.replay_buffer.end_trajectories()
 
     def _forget_episodes(self) -> None:
         self.episode_costs = np.zeros(self.n_envs)

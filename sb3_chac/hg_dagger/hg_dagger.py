@@ -17,7 +17,7 @@ from sb3_chac.common.buffers import DualReplayBuffer, TransitionStore
 from sb3_chac.common.checks import check_integer, check_range
 from sb3_chac.common.guided import GuidedOffPolicyAlgorithm
 from sb3_chac.common.utils import minimize
-from sb3_chac.human.demonstrations import Demonstrations, check_spaces, load_demonstrations
+from sb3_chac.human.demonstrations import Demonstrations, check_spaces
 
 SelfHGDagger = TypeVar("SelfHGDagger", bound="HGDagger")
 
@@ -128,7 +128,7 @@ class HGDagger(GuidedOffPolicyAlgorithm):
         if _init_setup_model:
             self._setup_model()
             if dataset is not None:
-                self._store_demonstrations(dataset)
+                self.store_demonstrations(dataset)
 
     def _setup_model(self) -> None:
         super()._setup_model()
@@ -151,16 +151,8 @@ class HGDagger(GuidedOffPolicyAlgorithm):
         check_spaces(env.observation_space, env.action_space)
         return GuidedOffPolicyAlgorithm._wrap_env(env, verbose, monitor_wrapper)
 
-    def _store_demonstrations(self, dataset: str | os.PathLike[str] | Demonstrations) -> None:
-        """As if the human had driven them in the warm-up; they are not counted as steps of this training."""
-        data = load_demonstrations(dataset, self.observation_space, self.action_space)
-        actions = self.policy.scale_action(data.actions).reshape(len(data), -1)
-        dones = data.terminations | data.truncations
-        columns = (data.observations, data.next_observations, actions, data.rewards, dones)
-        infos = [{"takeover": True, "TimeLimit.truncated": bool(truncated)} for truncated in data.truncations]
-        for i, info in enumerate(infos):
-            obs, next_obs, action, reward, done = (column[i : i + 1] for column in columns)
-            self.replay_buffer.add(obs, next_obs, action, reward, done, [info])
+    def store_demonstrations(self, dataset: str | os.PathLike[str] | Demonstrations) -> None:
+        super().store_demonstrations(dataset)
         self.demonstrated_rows = self.replay_buffer.human.added
 
     def _setup_learn(

@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from minari.data_collector import EpisodeBuffer
 
 SETTINGS = "sb3_chac"  # where Minari's metadata holds ours
+# Wrappers that change nothing of what is recorded: who takes over is in the actions
+LEFT_OUT = (InterventionWrapper.__name__, "Monitor")
 
 
 class DatasetWriter:
@@ -135,7 +137,7 @@ def storable_spec(env: gym.Env) -> EnvSpec | None:
     spec = env.spec
     if spec is None:
         return None
-    wrappers = tuple(wrapper for wrapper in spec.additional_wrappers if wrapper.name != InterventionWrapper.__name__)
+    wrappers = tuple(wrapper for wrapper in spec.additional_wrappers if wrapper.name not in LEFT_OUT)
     spec = replace(spec, additional_wrappers=wrappers)
     try:
         spec.to_json()

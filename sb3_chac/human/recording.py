@@ -165,7 +165,7 @@ class Recorder(Runner):
             rewards.append(float(reward))
             terminations.append(bool(terminated))
             truncations.append(bool(truncated))
-            steps.append(self._stored_infos(action, info))
+            steps.append(self.stored_infos(action, info))
         stacked = np.array(observations, self.env.observation_space.dtype)
         if not (np.isfinite(stacked).all() and np.isfinite(rewards).all()):
             raise ValueError(f"episode {number} of {self.env.unwrapped} has NaN or infinite values: mend the environment.")
@@ -189,7 +189,12 @@ class Recorder(Runner):
         return int(action) if isinstance(space, spaces.Discrete) else np.array(action, space.dtype)
 
     @staticmethod
-    def _stored_infos(action: Any, info: dict[str, Any]) -> dict[str, Any]:
+    def stored_infos(action: Any, info: dict[str, Any]) -> dict[str, Any]:
+        """
+        :param action: what the novice proposed, if there is one
+        :param info: of the step
+        :return: what a dataset holds of the step besides what Minari asks for
+        """
         watched = "takeover" in info
         return {
             "takeover": bool(info["takeover"]) if watched else True,

@@ -156,7 +156,7 @@ class PVP(GuidedOffPolicyAlgorithm, TD3):
 
         for _ in range(gradient_steps):
             self._n_updates += 1
-            batch = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
+            batch = self._sample_batch(batch_size)
             stats |= self._update_critic(batch)
 
             # Delayed policy updates
@@ -175,6 +175,9 @@ class PVP(GuidedOffPolicyAlgorithm, TD3):
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         for name, value in stats.items():
             self.logger.record(f"train/{name}", value)
+
+    def _sample_batch(self, batch_size: int) -> DualReplayBufferSamples:
+        return self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
 
     def _update_critic(self, batch: DualReplayBufferSamples) -> dict[str, float]:
         discounts = self.gamma if batch.discounts is None else batch.discounts

@@ -1,0 +1,332 @@
+"""Training that goes on beside the driving: gradient steps in a thread of their own."""
+
+import copy
+import functools
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import MaybeCallback
+
+from sb3_chac.chac import CHAC
+from sb3_chac.cockpit.session import Drive, DriveEnded, Novice
+from sb3_chac.common.guided import GuidedOffPolicyAlgorithm
+from sb3_chac.hg_dagger import HGDagger
+
+if TYPE_CHECKING:
+    Base = GuidedOffPolicyAlgorithm
+else:
+    Base = object
+
+
+class Learner(threading.Thread):
+    """
+    Makes the gradient steps that a model owes, in their order and number, one at a time. It leaves the moment of the next
+    step of the environment to the driver.
+
+    :param model: that learns
+    :param drive: beside which it learns
+    """
+
+    def __init__(self, model: "DrivenTraining", drive: Drive) -> None:
+        super().__init__(name="learner", daemon=True)
+        self.model, self.drive = model, drive
+        self.error: BaseException | None = None
+        self.seconds_per_step = 0.0  # running mean
+        self._stopped = False
+        self._changed = threading.Condition()
+        self._working = threading.Lock()  # held while the networks change
+
+    def owe(self, gradient_steps: int) -> None:
+        """
+        :param gradient_steps: to be made
+        :raises BaseException: what a gradient step has raised
+        """
+        self._raise_error()
+        with self._changed:
+            self.model.owed_steps += gradient_steps
+            self._changed.notify_all()
+
+    def drain(self) -> None:
+        """
+        Returns when nothing is owed.
+
+        :raises BaseException: what a gradient step has raised
+        """
+        with self._changed:
+            while self.model.owed_steps and self.error is None and not self._stopped:
+                self._changed.wait()
+        self._raise_error()
+
+    @contextmanager
+    def resting(self) -> Iterator[None]:
+        """The networks do not change inside the block."""
+        with self._working:
+            yield
+
+    def stop(self) -> None:
+        """Returns when the gradient step that is under way is made. What is owed stays so."""
+        with self._changed:
+            self._stopped = True
+            self._changed.notify_all()
+        if self.is_alive():
+            self.join()
+
+    def run(self) -> None:
+        while True:
+            with self._changed:
+                while not self._stopped and not self.model.owed_steps:
+                    self._changed.wait()
+                if self._stopped:
+                    return
+            self.drive.wait_for_room(self.seconds_per_step)
+            begun = time.monotonic()
+            try:
+                with self._working:
+                    self.model.train_now(1, self.model.batch_size)
+                    self.model.refresh_driver()
+            except BaseException as error:
+                self.error = error
+            seconds = time.monotonic() - begun
+            self.seconds_per_step += (0.2 if self.seconds_per_step else 1.0) * (seconds - self.seconds_per_step)
+            with self._changed:
+                self._changed.notify_all()
+                if self.error is not None:
+                    return
+                self.model.owed_steps -= 1
+                self.drive.lag = self.model.owed_steps
+
+    def _raise_error(self) -> None:
+        if self.error is not None:
+            raise self.error
+
+
+class DrivenTraining(Base):
+    """
+    Makes an algorithm fit for a drive: see ``driven``.
+
+    ``train`` only says how many gradient steps are due; a ``Learner`` makes them. Who drives is a copy of the policy, brought
+    up to date after each gradient step, so that no step of the environment waits for one. What takes long and is to
+    happen between two steps (C-HAC's fit at the beginning of stage 2, the rounds of HG-DAgger and IWR) is done where the
+    algorithm does it: the car waits, and the display says so.
+    """
+
+    drive: Drive
+    owed_steps = 0  # gradient steps; saved, so that they are made after a restart
+    driven_seconds = 0.0
+
+    def attach(self, drive: Drive) -> None:
+        """
+        To be called before ``learn``.
+
+        :param drive: in whose environment it learns
+        :raises ValueError: for what cannot be done in a drive
+        """
+        if self.use_sde:
+            raise ValueError("use_sde: a drive needs use_sde=False, generalised exploration is not supported in the cockpit.")
+        self.drive = drive
+        self.learner = Learner(self, drive)
+        self._this_thread = threading.local()
+        self._buffer_lock = threading.Lock()
+        self._driving_lock = threading.Lock()  # held while the driving policy acts or is refreshed
+        self._learner_logger = Logger(None, [])
+        self._driving_policy = copy.deepcopy(self._learning_policy)
+        self._pairs = tuple(
+            [*policy.parameters(), *policy.buffers()] for policy in (self._driving_policy, self._learning_policy)
+        )
+        drive.show(seconds=self.driven_seconds, total_steps=int(self.counts["total_steps"]))
+        drive.show(human_steps=int(self.counts["human_steps"]))
+        self._tell()
+
+    # Two policies and two loggers: each thread has its own
+
+    @property
+    def policy(self) -> Any:  # type: ignore[override]
+        acts = "_this_thread" in self.__dict__ and getattr(self._this_thread, "acts", False)
+        return self._driving_policy if acts else self._learning_policy
+
+    @policy.setter
+    def policy(self, policy: BasePolicy) -> None:
+        self._learning_policy = policy
+
+    @property
+    def logger(self) -> Logger:
+        if "learner" in self.__dict__ and threading.current_thread() is self.learner:
+            return self._learner_logger
+        return self._logger
+
+    def dump_logs(self) -> None:
+        if "learner" in self.__dict__:
+            for name, value in dict(self._learner_logger.name_to_value).items():
+                self._logger.record(name, value)
+            self._logger.record("time/owed_gradient_steps", self.owed_steps)
+        super().dump_logs()
+
+    @th.no_grad()
+    def refresh_driver(self) -> None:
+        """The driving policy becomes what was learned."""
+        with self._driving_lock:
+            th._foreach_copy_(*self._pairs)
+
+    # Learning
+
+    def train(self, gradient_steps: int, batch_size: int = 64) -> None:
+        self.learner.owe(gradient_steps)
+        self.drive.lag = self.owed_steps
+
+    def train_now(self, gradient_steps: int, batch_size: int) -> None:
+        """The algorithm's own ``train``."""
+        super().train(gradient_steps, batch_size)
+
+    def pretrain(self, gradient_steps: int) -> None:
+        """
+        Gradient steps on what the replay buffer holds, before the drive begins.
+
+        :param gradient_steps: number
+        """
+        self._setup_learn(0)  # makes the logger, the learner begins
+        self._update_current_progress_remaining(0, 1)
+        self.learner.owe(gradient_steps)
+        self.learner.drain()
+
+    def _sample_batch(self, batch_size: int) -> Any:
+        with self._buffer_lock:
+            return super()._sample_batch(batch_size)  # type: ignore[misc]
+
+    @contextmanager
+    def _car_waits(self, why: str) -> Iterator[None]:
+        """
+        Long work between two steps of the environment.
+
+        :param why: is shown
+        """
+        self.drive.busy = why
+        try:
+            self.learner.drain()
+            with self.learner.resting():
+                yield
+            self.refresh_driver()
+        finally:
+            self.drive.busy = ""
+
+    def _start_stage_2(self) -> None:
+        with self._car_waits("The car waits: C-HAC prepares stage 2"):
+            super()._start_stage_2()  # type: ignore[misc]
+        self._arm()  # who sits at the wheel may go on taking over
+        self._tell()
+
+    def _needs_human(self) -> bool:
+        return True
+
+    # Driving
+
+    def _sample_action(
+        self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
+    ) -> tuple[np.ndarray, np.ndarray]:
+        with self._driving_lock:
+            self._this_thread.acts = True
+            try:
+                sampled = super()._sample_action(learning_starts, action_noise, n_envs)
+                self._tell()
+            finally:
+                self._this_thread.acts = False
+        return sampled
+
+    def _tell(self) -> None:
+        """What the display shows of the novice."""
+        choice = getattr(self.policy, "last_choice", None)
+        if isinstance(self, HGDagger):
+            stage = f"round {self.round}" if self.round else "warm-up: you drive"
+        elif isinstance(self, CHAC):
+            stage = "2: self-learning" if self.stage == 2 else "1: you guide"
+        else:
+            stage = "you guide"
+        self.drive.novice = (
+            Novice(stage) if choice is None else Novice(stage, bool(choice.self_drives[0]), float(choice.confidence[0]))
+        )
+        self.drive.show(novice=self.drive.novice)
+
+    def _store_transition(
+        self,
+        replay_buffer: ReplayBuffer,
+        buffer_action: np.ndarray,
+        new_obs: np.ndarray | dict[str, np.ndarray],
+        reward: np.ndarray,
+        dones: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        if infos[0].get("unattended"):  # nobody's decision: nothing is to be learned from it
+            self.replay_buffer.end_trajectories()
+            self._forget_episodes()
+            self._last_obs = new_obs
+            return
+        with self._buffer_lock:
+            super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+        self.driven_seconds = self.drive.display.seconds
+
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        reset_num_timesteps: bool = True,
+        tb_log_name: str = "run",
+        progress_bar: bool = False,
+    ) -> tuple[int, BaseCallback]:
+        prepared = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
+        self._callback = prepared[1]
+        self.refresh_driver()
+        if not self.learner.is_alive():
+            self.learner.start()
+        return prepared
+
+    def learn(self, *args: Any, **kwargs: Any) -> Any:  # type: ignore[override]
+        """
+        As the algorithm's, but it returns early when the person quits. Everything driven is stored then.
+        """
+        try:
+            super().learn(*args, **kwargs)
+            self.drive.busy = "The last gradient steps are made" if self.owed_steps else ""
+            self.learner.drain()
+        except DriveEnded:
+            self._callback.on_training_end()
+        finally:
+            self.learner.stop()
+        return self
+
+    def _excluded_save_params(self) -> list[str]:
+        own = ["drive", "learner", "_this_thread", "_buffer_lock", "_driving_lock", "_learner_logger", "_driving_policy"]
+        return [*super()._excluded_save_params(), *own, "_pairs", "_learning_policy", "_callback"]
+
+    def save(self, *args: Any, **kwargs: Any) -> None:
+        """As SB3's, between two gradient steps."""
+        with self.learner.resting():
+            super().save(*args, **kwargs)
+
+
+class DrivenRounds(DrivenTraining):
+    """``DrivenTraining`` of HG-DAgger and IWR: the novice is fitted between the rounds, where the algorithm does it."""
+
+    def train(self, gradient_steps: int, batch_size: int = 64) -> None:
+        assert isinstance(self, HGDagger)
+        if self._is_round_over() or self.num_timesteps >= self._total_timesteps:
+            with self._car_waits("The car waits: the novice is fitted to what you drove"):
+                self.train_now(gradient_steps, batch_size)
+
+
+@functools.cache
+def driven(algorithm: type[GuidedOffPolicyAlgorithm]) -> type[Any]:
+    """
+    :param algorithm: that learns from takeovers
+    :return: the same algorithm for a drive, see ``DrivenTraining``; what it saves is the algorithm's
+    """
+    base = DrivenRounds if issubclass(algorithm, HGDagger) else DrivenTraining
+    return type(f"Driven{algorithm.__name__}", (base, algorithm), {})

@@ -1,0 +1,178 @@
+"""A drive from its beginning to its end: what runs in the driving thread."""
+
+import argparse
+import contextlib
+import io
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+from rl_zoo3.exp_manager import ExperimentManager
+from rl_zoo3.utils import ALGOS
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+import sb3_chac
+from sb3_chac.cockpit.devices import Device
+from sb3_chac.cockpit.env import Cockpit
+from sb3_chac.cockpit.learner import DrivenTraining, driven
+from sb3_chac.cockpit.person import STEERS_LEFT, NotDrivable, Person, check_drivable
+from sb3_chac.cockpit.recording import Recorder, Summary
+from sb3_chac.cockpit.session import Drive
+from sb3_chac.common.checkpoints import ResumableCheckpoint
+from sb3_chac.common.guided import GuidedOffPolicyAlgorithm
+from sb3_chac.human.intervention import InterventionWrapper
+from sb3_chac.zoo import register
+from sb3_chac.zoo.registration import ALGORITHMS
+
+
+def drivable_algorithms() -> dict[str, type[GuidedOffPolicyAlgorithm]]:
+    """
+    :return: by their names on the command line, the algorithms that learn from takeovers
+    """
+    classes = {name: getattr(sb3_chac, public) for name, public in ALGORITHMS.items()}
+    return {name: found for name, found in classes.items() if issubclass(found, GuidedOffPolicyAlgorithm)}
+
+
+DEFAULT_RATE = 10.0  # [1/s]
+
+
+class EpisodeCheckpoint(ResumableCheckpoint):
+    """
+    Writes them at the beginning of an episode, when nobody is driving at speed.
+
+    :param cockpit: tells when that is
+    """
+
+    def __init__(self, cockpit: Cockpit, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.cockpit = cockpit
+
+    def _on_rollout_start(self) -> None:
+        if self.cockpit.steps <= 1:  # a rollout may be of two steps
+            super()._on_rollout_start()
+
+
+class DriveManager(ExperimentManager):
+    """
+    RL-Zoo3's experiment in which a person drives: hyperparameters, folders and files are those of ``rl_zoo3 train``. There is
+    one environment; in the place of the yaml's ``InterventionWrapper`` stands the person's.
+
+    :param wrap: puts the person and the cockpit around the environment
+    """
+
+    def __init__(self, wrap: Callable[[gym.Env], gym.Env], args: argparse.Namespace, model: str) -> None:
+        super().__init__(
+            args,
+            args.algo,
+            args.env,
+            args.log_folder,
+            n_timesteps=args.n_timesteps,
+            eval_freq=-1,
+            save_freq=0,
+            hyperparams={**args.hyperparams, "n_envs": 1},
+            env_kwargs={**args.env_kwargs, "render_mode": "rgb_array"},
+            trained_agent=model,
+            seed=args.seed,
+            log_interval=1,
+            verbose=args.verbose,
+            config=args.conf_file,
+        )
+        self.wrap = wrap
+        self.vec_env_class = DummyVecEnv
+
+    def _preprocess_hyperparams(self, hyperparams: dict[str, Any]) -> Any:
+        if hyperparams.get("normalize"):
+            raise NotDrivable("normalize: the cockpit knows no VecNormalize, choose hyperparameters without it (-params).")
+        others = hyperparams.pop("env_wrapper", None) or []
+        others = [others] if isinstance(others, str | dict) else list(others)
+        others = [entry for entry in others if InterventionWrapper.__name__ not in str(entry)]
+        if others:
+            hyperparams["env_wrapper"] = others
+        found, wrapper, callbacks, vec_env_wrapper = super()._preprocess_hyperparams(hyperparams)
+        wrap = self.wrap if wrapper is None else lambda env: self.wrap(wrapper(env))
+        return found, wrap, callbacks, vec_env_wrapper
+
+
+class DriveRun:
+    """
+    One drive, in a thread of its own: environment, model and all that is written belong to it.
+
+    :param args: of the command line, see ``sb3_chac.drive``
+    :param device: that the person holds
+    :param model: checkpoint to go on from, "" for a new training
+    """
+
+    def __init__(self, args: argparse.Namespace, device: Device, model: str = "") -> None:
+        register()
+        self.args, self.checkpoint_to_load = args, model
+        self.drive = Drive(Person(device), args.rate or DEFAULT_RATE)
+        self.summary: Summary | None = None
+        self.run_folder: Path | None = None
+        self.error: BaseException | None = None
+        self.cockpit: Cockpit | None = None
+        self.thread = threading.Thread(target=self._run, name="driving", daemon=True)
+
+    @property
+    def is_over(self) -> bool:
+        return not self.thread.is_alive()
+
+    def _run(self) -> None:
+        try:
+            self._drive()
+        except BaseException as error:  # for the main thread to tell
+            self.error = error
+        finally:
+            self.drive.quit()
+
+    def _drive(self) -> None:
+        args = self.args
+        algorithm = drivable_algorithms()[args.algo]
+        ALGOS[args.algo] = driven(algorithm)
+        try:
+            self.manager = DriveManager(self._wrap, args, self.checkpoint_to_load)
+            self.run_folder = Path(self.manager.save_path)
+            with contextlib.redirect_stdout(io.StringIO()) if args.verbose == 0 else contextlib.nullcontext():
+                model, _ = self.manager.setup_experiment()  # type: ignore[misc]
+        finally:
+            ALGOS[args.algo] = algorithm
+        self._learn(model)
+
+    def _learn(self, model: DrivenTraining) -> None:
+        args, manager = self.args, self.manager
+        assert self.cockpit is not None
+        model.attach(self.drive)
+        if args.demos:
+            model.store_demonstrations(args.demos)
+        save_freq = args.save_freq
+        checkpoint = EpisodeCheckpoint(self.cockpit, save_freq, manager.save_path, manager.env_name)
+        checkpoint.init_callback(model)
+        if save_freq > 0:
+            manager.callbacks.append(checkpoint)
+        try:
+            if args.pretrain:
+                self.drive.busy = f"The car waits: {args.pretrain} gradient steps on {args.demos}"
+                model.pretrain(args.pretrain)
+                self.drive.busy = ""
+            with contextlib.redirect_stdout(io.StringIO()) if args.verbose == 0 else contextlib.nullcontext():
+                manager.learn(model)
+                self.drive.ended = True
+                checkpoint.save()
+                manager.save_trained_model(model)
+        finally:
+            self.drive.ended = True
+            self.summary = self.cockpit.recorder.finish()
+
+    def _wrap(self, env: gym.Env) -> gym.Env:
+        check_drivable(env)
+        args, person = self.args, self.drive.person
+        steers_left = args.env in STEERS_LEFT if args.steering == "auto" else args.steering == "left"
+        person.sit_in(env.action_space, steers_left)  # type: ignore[arg-type]
+        if args.rate is None:
+            self.drive.period = 1 / float(env.metadata.get("render_fps") or DEFAULT_RATE)
+        assert self.run_folder is not None
+        watched = InterventionWrapper(env, expert=person, rule=person.drives)
+        recorder = Recorder(self.run_folder, env, args.dataset, f"{args.algo} and a person", self.drive.period)
+        self.cockpit = Cockpit(watched, self.drive, recorder)
+        return self.cockpit

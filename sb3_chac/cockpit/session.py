@@ -1,0 +1,194 @@
+"""What the threads of a drive share: the clock of the steps, pause and quit, and what there is to be seen."""
+
+import threading
+import time
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from sb3_chac.cockpit.person import Person
+
+TO_BEGIN = "Ready: P begins"
+
+
+class DriveEnded(Exception):  # noqa: N818
+    """Raised in the driving thread when the person has quit. The environment has not made the step."""
+
+
+@dataclass(frozen=True)
+class Novice:
+    """
+    What the learning driver says of itself.
+
+    :param stage: of the training, to read
+    :param self_drives: C-HAC in stage 2: whether the self-learning policy acts
+    :param confidence: C-HAC in stage 2: P(Q_r > Q_g)
+    """
+
+    stage: str = ""
+    self_drives: bool | None = None
+    confidence: float | None = None
+
+
+@dataclass(frozen=True)
+class Display:
+    """
+    What the cockpit shows of the last step.
+
+    :param picture: of the environment, shape (height, width, 3), uint8
+    :param number: of the picture
+    :param speed: [m/s], None if the environment does not tell
+    :param takeover: whether the person drove
+    :param proposed: by the novice: steering (-1 left to 1 right) and pedals (-1 brake to 1 throttle)
+    :param applied: what was executed
+    :param total_steps: of the training
+    :param human_steps: of them driven by the person
+    :param seconds: [s] driven, without pauses
+    :param episode: number of the episode in this drive
+    :param cost: safety cost of this drive
+    """
+
+    picture: np.ndarray | None = None
+    number: int = 0
+    speed: float | None = None
+    takeover: bool = False
+    proposed: tuple[float, float] = (0.0, 0.0)
+    applied: tuple[float, float] = (0.0, 0.0)
+    total_steps: int = 0
+    human_steps: int = 0
+    seconds: float = 0.0
+    episode: int = 0
+    cost: float = 0.0
+    novice: Novice = Novice()
+
+    @property
+    def takeover_rate(self) -> float:
+        return self.human_steps / self.total_steps if self.total_steps else 0.0
+
+
+class Drive:
+    """
+    One drive. The driving thread waits in ``wait_for_tick``; everything else may be called from any thread.
+
+    :param person: at the wheel
+    :param rate: [1/s] steps in real time, at most
+    """
+
+    def __init__(self, person: Person, rate: float = 10.0) -> None:
+        self.person = person
+        self.period = 1 / rate
+        self.display = Display()  # replaced as a whole
+        self.novice = Novice()
+        self.lag = 0  # gradient steps that the learner owes
+        self.busy = ""  # why the car waits though nobody paused
+        self.message = TO_BEGIN
+        self.paused = True
+        self.ended = False
+        self._skip = False
+        self._changed = threading.Condition()
+        self._next_tick = time.monotonic()
+
+    # What the person wants
+
+    def pause(self, message: str = "Paused: P goes on") -> None:
+        """
+        :param message: why
+        """
+        with self._changed:
+            self.paused, self.message = True, message
+            self._changed.notify_all()
+
+    def go_on(self) -> None:
+        """Ends a pause, unless there is nothing to take over with."""
+        if not self.person.read().connected:
+            self.pause(lost_message(self.person.device.name))
+            return
+        with self._changed:
+            self.paused, self.message = False, ""
+            self._changed.notify_all()
+
+    def toggle_pause(self) -> None:
+        """Pauses, or goes on."""
+        self.go_on() if self.paused else self.pause()
+
+    def skip(self) -> None:
+        """The next step is the last of the episode. If it is paused, the next episode waits."""
+        with self._changed:
+            self._skip = True
+            self._changed.notify_all()
+
+    def quit(self) -> None:
+        """Ends the drive before its next step."""
+        with self._changed:
+            self.ended = True
+            self._changed.notify_all()
+
+    # For the driving thread
+
+    def wait_for_tick(self) -> None:
+        """
+        Returns when the next step is due, ``period`` after the last one at the earliest; in a pause, when it is over.
+
+        :raises DriveEnded: if the person has quit
+        """
+        with self._changed:
+            while True:
+                if self.ended:
+                    raise DriveEnded
+                if self.paused and not self._skip:
+                    self._changed.wait()
+                    continue
+                remaining = self._next_tick - time.monotonic()
+                if remaining <= 0:
+                    break
+                self._changed.wait(remaining)
+            # From now, not from when it was due: what was late is not caught up by being too fast
+            self._next_tick = time.monotonic() + self.period
+            self._changed.notify_all()
+
+    def take_skip(self) -> bool:
+        """
+        :return: whether the episode is to end
+        """
+        with self._changed:
+            skip, self._skip = self._skip, False
+        return skip
+
+    def show(self, **changes: Any) -> None:
+        """
+        :param changes: of ``display``
+        """
+        self.display = replace(self.display, **changes)
+
+    # For those who work beside it
+
+    def time_to_tick(self) -> float:
+        """
+        :return: [s] until the next step, infinite in a pause
+        """
+        return float("inf") if self.paused else self._next_tick - time.monotonic()
+
+    def wait_for_room(self, seconds: float) -> None:
+        """
+        Keeps the moment of the next step free: returns when there are ``seconds`` before it, or the step is under way.
+
+        :param seconds: [s] that are needed; with more than most of a period there is no point in waiting
+        """
+        if seconds > 0.8 * self.period:
+            return
+        with self._changed:
+            while not self.ended and 0 < (remaining := self.time_to_tick()) < seconds:
+                self._changed.wait(remaining + 0.001)
+
+
+def lost_message(device: str) -> str:
+    """
+    :param device: its name
+    :return: what to tell a person whose device is gone
+    """
+    if device == "keyboard":
+        return "The window has lost the keyboard: click into it, then P goes on"
+    if device == "browser":
+        return "Nobody is at the wheel: connect and take it, then P goes on"
+    return f"No {device}: plug it in, or press K for the keyboard; then P goes on"

@@ -1,0 +1,287 @@
+"""``python -m sb3_chac drive``: train with a person at the wheel."""
+
+import argparse
+import os
+import re
+import shlex
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import torch as th
+
+from sb3_chac.cockpit.devices import (
+    GAMEPAD,
+    WHEEL,
+    Calibration,
+    Device,
+    DeviceError,
+    Joystick,
+    Keyboard,
+    is_wheel,
+    load_config,
+    save_config,
+)
+from sb3_chac.cockpit.person import NotDrivable
+from sb3_chac.common.episodes import NotEvaluable
+from sb3_chac.evaluate import DEFAULT_ENV, parse_env_kwargs
+from sb3_chac.human.demonstrations import DatasetError
+
+DESCRIPTION = """Train with yourself as the human: watch the novice drive, take over at any moment, hand back.
+
+  sb3-chac drive --algo chac --env SafeDrive-v0                       in a window, with the keyboard
+  sb3-chac drive --algo chac --env SafeDrive-v0 --device wheel        with a steering wheel (see --calibrate)
+  sb3-chac drive --algo chac --env SafeDrive-v0 --serve 127.0.0.1:8000    in a browser
+  sb3-chac drive --resume logs/chac/SafeDrive-v0_1                    go on, with all that was learned and driven
+
+Hyperparameters, run folders and files are those of 'rl_zoo3 train'. The drive is recorded as a dataset (see 'sb3-chac demos').
+The operator's guide is sb3_chac/cockpit/README.md."""
+
+SAVE_FREQ = 600  # steps: a minute
+
+
+def make_parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        "sb3-chac drive", description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    what = parser.add_argument_group("what is trained")
+    what.add_argument("--algo", default="chac", help="chac, dpvp, pvp, hg_dagger or iwr (default: %(default)s)")
+    what.add_argument("--env", default=DEFAULT_ENV, metavar="ID", help="environment (default: %(default)s)")
+    what.add_argument("--env-kwargs", nargs="+", default=[], metavar="KEY:VALUE", help="passed to it, Python literals")
+    what.add_argument("-params", "--hyperparams", nargs="+", default=[], metavar="KEY:VALUE", help="other hyperparameters")
+    what.add_argument("--conf-file", metavar="FILE", help="other hyperparameters file")
+    what.add_argument("-n", "--n-timesteps", type=int, default=-1, metavar="N", help="steps in all (default: the yaml's)")
+    what.add_argument("--seed", type=int, default=-1, help="default: a random one")
+    what.add_argument("--demos", default="", metavar="ID", help="begin with what this dataset holds")
+    what.add_argument("--pretrain", type=int, default=0, metavar="N", help="gradient steps on it before the drive")
+    how = parser.add_argument_group("how it is driven")
+    how.add_argument("--device", default="auto", choices=("auto", "keyboard", "gamepad", "wheel"), help="(default: %(default)s)")
+    how.add_argument("--config", type=Path, metavar="FILE", help="axes and buttons of gamepad or wheel, see --calibrate")
+    how.add_argument("--serve", metavar="HOST:PORT", help="in a browser in place of a window, e.g. 127.0.0.1:8000")
+    how.add_argument("--rate", type=float, metavar="HZ", help="steps per second (default: the environment's own real time)")
+    how.add_argument(
+        "--steering", default="auto", choices=("auto", "left", "right"), help="side of the greatest first action (%(default)s)"
+    )
+    how.add_argument("--go", action="store_true", help="begin at once, do not wait for P")
+    where = parser.add_argument_group("what is written")
+    where.add_argument("-f", "--log-folder", default="logs", help="(default: %(default)s)")
+    where.add_argument("--dataset", metavar="ID", help="of the recording (default: drives/<algo>-<env>-<time>-v0)")
+    where.add_argument(
+        "--save-freq", type=int, default=SAVE_FREQ, metavar="N", help="steps between checkpoints, 0: at the end only (%(default)s)"
+    )
+    where.add_argument("--verbose", type=int, default=0, help="1: RL-Zoo3's and the logger's output (default: %(default)s)")
+    other = parser.add_argument_group("in place of a new drive")
+    other.add_argument("--resume", type=Path, metavar="RUN_FOLDER", help="go on with this drive; other arguments override its own")
+    other.add_argument("--recover", type=Path, metavar="RUN_FOLDER", help="make the dataset of a drive that was killed")
+    other.add_argument("--calibrate", type=Path, metavar="FILE", help="find out what axes and buttons a device has")
+    return parser
+
+
+def main(arguments: list[str]) -> None:
+    """
+    :param arguments: of the command line, after ``drive``
+    """
+    parser = make_parser()
+    args = parser.parse_args(arguments)
+    th.set_num_threads(1)
+    try:
+        if args.calibrate:
+            calibrate(args.calibrate)
+        elif args.recover:
+            recover(args.recover)
+        else:
+            run(args, arguments)
+    except (NotDrivable, NotEvaluable, DeviceError, DatasetError, OSError, ValueError, RuntimeError) as error:
+        if os.environ.get("SB3_CHAC_TRACEBACK"):
+            raise
+        parser.exit(2, f"{parser.prog}: error: {error}\n")
+
+
+def recover(run_folder: Path) -> None:
+    """
+    :param run_folder: of a drive that was killed
+    :raises NotDrivable: if it left nothing behind
+    """
+    from sb3_chac.cockpit.recording import finish_recording
+
+    summary = finish_recording(run_folder)
+    if summary is None:
+        raise NotDrivable(f"{run_folder} holds no recording that is not finished.")
+    print(summary)
+
+
+def run(args: argparse.Namespace, arguments: list[str]) -> None:
+    """
+    :param args: see ``make_parser``
+    :param arguments: that they come from
+    """
+    from sb3_chac.cockpit.recording import finish_recording
+    from sb3_chac.resume import NotResumable, find_training
+
+    model = ""
+    if args.resume:
+        try:
+            command, checkpoint = find_training(args.resume)
+        except NotResumable as error:
+            raise NotDrivable(str(error)) from error
+        if command[:1] != ["drive"]:
+            raise NotDrivable(f"{args.resume} was not driven: go on with 'sb3-chac resume {args.resume}'.")
+        left_behind = finish_recording(args.resume)
+        if left_behind is not None:
+            print(f"What the drive that was interrupted had recorded:\n{left_behind}\n")
+        arguments = [*command[1:], *without_resume(arguments)]
+        args = make_parser().parse_args(arguments)
+        model = str(checkpoint)
+    check_arguments(args)
+    # What RL-Zoo3 writes into the run folder, and 'sb3-chac resume' repeats
+    sys.argv[1:] = ["drive", *arguments]
+    drive(args, model)
+
+
+def without_resume(arguments: list[str]) -> list[str]:
+    """
+    :return: the arguments that are not ``--resume RUN_FOLDER``
+    """
+    kept, skip = [], False
+    for argument in arguments:
+        if not skip and not argument.startswith("--resume"):
+            kept.append(argument)
+        skip = argument == "--resume"
+    return kept
+
+
+def check_arguments(args: argparse.Namespace) -> None:
+    """
+    Also fills in what was left open.
+
+    :raises NotDrivable: for what does not fit
+    """
+    import gymnasium as gym
+    import numpy as np
+
+    import sb3_chac.envs  # noqa: F401
+    from sb3_chac.cockpit.run import drivable_algorithms
+
+    if args.algo not in drivable_algorithms():
+        known = ", ".join(drivable_algorithms())
+        raise NotDrivable(f"--algo {args.algo} does not learn from takeovers, choose from {known}.")
+    if args.env not in gym.registry:
+        raise NotDrivable(f"--env: gymnasium knows no {args.env!r}.")
+    for option, low in (("pretrain", 0), ("save_freq", 0)):
+        if getattr(args, option) < low:
+            raise NotDrivable(f"--{option.replace('_', '-')} must be at least {low}, got {getattr(args, option)}.")
+    if args.pretrain and not args.demos:
+        raise NotDrivable("--pretrain needs --demos: there is nothing to learn from before the drive.")
+    if args.rate is not None and not 0.5 <= args.rate <= 100:
+        raise NotDrivable(f"--rate must be from 0.5 to 100 steps per second, got {args.rate:g}.")
+    if args.device == "keyboard" and args.config:
+        raise NotDrivable("--config is for a gamepad or wheel, the keyboard needs none.")
+    if args.seed < 0:
+        args.seed = int(np.random.default_rng().integers(2**32 - 1))
+    args.env_kwargs = parse_env_kwargs(args.env_kwargs)
+    args.hyperparams = parse_env_kwargs(args.hyperparams)
+    if args.dataset is None:
+        env = re.sub(r"-v\d+$", "", args.env).replace("/", "-")
+        args.dataset = f"drives/{args.algo}-{env}-{time.strftime('%Y%m%d-%H%M%S')}-v0"
+
+
+def drive(args: argparse.Namespace, model: str) -> None:
+    """
+    :param args: see ``make_parser``, checked
+    :param model: checkpoint to go on from, or ""
+    """
+    from sb3_chac.cockpit.run import DriveRun
+
+    if args.serve:
+        from sb3_chac.cockpit.server import Server
+
+        front: Any = Server(args.serve)
+        drive_run = DriveRun(args, front.device, model)
+    else:
+        os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
+        from sb3_chac.cockpit.window import Window
+
+        front = Window(f"sb3_chac: {args.algo} on {args.env}")
+        drive_run = DriveRun(args, find_device(args), model)
+    try:
+        drive_run.thread.start()
+        if args.go:
+            drive_run.drive.go_on()
+        wait_for_end(front, drive_run)
+    finally:
+        front.close()
+    if drive_run.summary is not None:
+        print(drive_run.summary)
+        print(f"  run folder    {drive_run.run_folder}")
+        print(f"Go on with:  sb3-chac drive --resume {shlex.quote(str(drive_run.run_folder))}")
+    if drive_run.error is not None:
+        raise drive_run.error
+
+
+def wait_for_end(front: Any, drive_run: Any) -> None:
+    """
+    :param front: window or server
+    :param drive_run: that it shows. Ctrl-C ends it as Q does
+    """
+    while True:
+        try:
+            front.run(drive_run.drive, lambda: drive_run.is_over)
+            drive_run.thread.join()
+            return
+        except KeyboardInterrupt:
+            drive_run.drive.quit()
+
+
+def find_device(args: argparse.Namespace) -> Device:
+    """
+    :param args: see ``make_parser``
+    :raises DeviceError: for a configuration that cannot be used
+    """
+    import pygame
+
+    config = load_config(args.config) if args.config else None
+    if args.device == "keyboard":
+        return Keyboard()
+    pygame.joystick.init()
+    names = [pygame.joystick.Joystick(i).get_name() for i in range(pygame.joystick.get_count())]
+    if args.device == "auto" and not names:
+        return Keyboard()
+    wheel = args.device == "wheel" or (args.device == "auto" and is_wheel(names[0]))
+    return Joystick(config or (WHEEL if wheel else GAMEPAD))
+
+
+def calibrate(file: Path) -> None:
+    """
+    :param file: YAML, is written
+    :raises DeviceError: if there is no device, or no sense in what it says
+    """
+    import pygame
+
+    if file.exists():
+        raise DeviceError(f"{file} exists already. Choose another name.")
+    pygame.display.init()
+    pygame.joystick.init()
+    if pygame.joystick.get_count() == 0:
+        raise DeviceError("No gamepad or wheel is plugged in.")
+    joystick = pygame.joystick.Joystick(0)
+    calibration = Calibration(joystick.get_name())
+    while calibration.step:
+        button = calibration.step == "takeover"
+        print(calibration.question + ("." if button else ", then press Enter here."))
+        if not button:
+            input()
+        while True:
+            for event in pygame.event.get():
+                if event.type != pygame.JOYBUTTONDOWN or button:
+                    calibration.handle(event)
+            if not button or not calibration.step:
+                break
+            pygame.time.wait(20)
+        if not button:
+            try:
+                calibration.answer()
+            except DeviceError as error:
+                print(error)
+    save_config(file, calibration.config())
+    print(f"Saved {file}: sb3-chac drive --device wheel --config {file}")
