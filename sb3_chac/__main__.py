@@ -12,7 +12,7 @@ COMMANDS = ("train", "enjoy", "plot_train", "plot_from_file", "all_plots", *OWN_
 USAGE = f"""usage: sb3-chac {{{",".join(COMMANDS)}}} ...
 
 RL-Zoo3's commands with the algorithms of sb3_chac, and
-  drive                 train with yourself as the human: window or browser; keyboard, gamepad or steering wheel
+  drive                 train with yourself as the human, in a window: keyboard, gamepad or steering wheel
   evaluate MODEL.zip    a model or an expert on held-out scenarios
   resume RUN_FOLDER     go on with a training that was interrupted or killed, from its newest checkpoint
   plot RUN_FOLDER       its curves: return, success rate, safety cost, what the human drove

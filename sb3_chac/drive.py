@@ -32,11 +32,9 @@ DESCRIPTION = """Train with yourself as the human: watch the novice drive, take 
 
   sb3-chac drive --algo chac --env SafeDrive-v0                       in a window, with the keyboard
   sb3-chac drive --algo chac --env SafeDrive-v0 --device wheel        with a steering wheel (see --calibrate)
-  sb3-chac drive --algo chac --env SafeDrive-v0 --serve 127.0.0.1:8000    in a browser
   sb3-chac drive --resume logs/chac/SafeDrive-v0_1                    go on, with all that was learned and driven
 
-Hyperparameters, run folders and files are those of 'rl_zoo3 train'. The drive is recorded as a dataset (see 'sb3-chac demos').
-The operator's guide is sb3_chac/cockpit/README.md."""
+Hyperparameters, run folders and files are those of 'rl_zoo3 train'. The drive is recorded as a dataset (see 'sb3-chac demos')."""
 
 SAVE_FREQ = 600  # steps: a minute
 
@@ -56,9 +54,10 @@ def make_parser() -> argparse.ArgumentParser:
     what.add_argument("--demos", default="", metavar="ID", help="begin with what this dataset holds")
     what.add_argument("--pretrain", type=int, default=0, metavar="N", help="gradient steps on it before the drive")
     how = parser.add_argument_group("how it is driven")
-    how.add_argument("--device", default="auto", choices=("auto", "keyboard", "gamepad", "wheel"), help="(default: %(default)s)")
+    how.add_argument(
+        "--device", default="auto", choices=("auto", "keyboard", "gamepad", "wheel"), help="(default: %(default)s)"
+    )
     how.add_argument("--config", type=Path, metavar="FILE", help="axes and buttons of gamepad or wheel, see --calibrate")
-    how.add_argument("--serve", metavar="HOST:PORT", help="in a browser in place of a window, e.g. 127.0.0.1:8000")
     how.add_argument("--rate", type=float, metavar="HZ", help="steps per second (default: the environment's own real time)")
     how.add_argument(
         "--steering", default="auto", choices=("auto", "left", "right"), help="side of the greatest first action (%(default)s)"
@@ -68,11 +67,17 @@ def make_parser() -> argparse.ArgumentParser:
     where.add_argument("-f", "--log-folder", default="logs", help="(default: %(default)s)")
     where.add_argument("--dataset", metavar="ID", help="of the recording (default: drives/<algo>-<env>-<time>-v0)")
     where.add_argument(
-        "--save-freq", type=int, default=SAVE_FREQ, metavar="N", help="steps between checkpoints, 0: at the end only (%(default)s)"
+        "--save-freq",
+        type=int,
+        default=SAVE_FREQ,
+        metavar="N",
+        help="steps between checkpoints, 0: at the end only (%(default)s)",
     )
     where.add_argument("--verbose", type=int, default=0, help="1: RL-Zoo3's and the logger's output (default: %(default)s)")
     other = parser.add_argument_group("in place of a new drive")
-    other.add_argument("--resume", type=Path, metavar="RUN_FOLDER", help="go on with this drive; other arguments override its own")
+    other.add_argument(
+        "--resume", type=Path, metavar="RUN_FOLDER", help="go on with this drive; other arguments override its own"
+    )
     other.add_argument("--recover", type=Path, metavar="RUN_FOLDER", help="make the dataset of a drive that was killed")
     other.add_argument("--calibrate", type=Path, metavar="FILE", help="find out what axes and buttons a device has")
     return parser
@@ -192,25 +197,17 @@ def drive(args: argparse.Namespace, model: str) -> None:
     :param model: checkpoint to go on from, or ""
     """
     from sb3_chac.cockpit.run import DriveRun
+    from sb3_chac.cockpit.window import Window
 
-    if args.serve:
-        from sb3_chac.cockpit.server import Server
-
-        front: Any = Server(args.serve)
-        drive_run = DriveRun(args, front.device, model)
-    else:
-        os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
-        from sb3_chac.cockpit.window import Window
-
-        front = Window(f"sb3_chac: {args.algo} on {args.env}")
-        drive_run = DriveRun(args, find_device(args), model)
+    window = Window(f"sb3_chac: {args.algo} on {args.env}")
+    drive_run = DriveRun(args, find_device(args), model)
     try:
         drive_run.thread.start()
         if args.go:
             drive_run.drive.go_on()
-        wait_for_end(front, drive_run)
+        wait_for_end(window, drive_run)
     finally:
-        front.close()
+        window.close()
     if drive_run.summary is not None:
         print(drive_run.summary)
         print(f"  run folder    {drive_run.run_folder}")
@@ -219,14 +216,14 @@ def drive(args: argparse.Namespace, model: str) -> None:
         raise drive_run.error
 
 
-def wait_for_end(front: Any, drive_run: Any) -> None:
+def wait_for_end(window: Any, drive_run: Any) -> None:
     """
-    :param front: window or server
+    :param window: of the cockpit
     :param drive_run: that it shows. Ctrl-C ends it as Q does
     """
     while True:
         try:
-            front.run(drive_run.drive, lambda: drive_run.is_over)
+            window.run(drive_run.drive, lambda: drive_run.is_over)
             drive_run.thread.join()
             return
         except KeyboardInterrupt:

@@ -331,7 +331,9 @@ def load_config(file: Path) -> JoystickConfig:
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise DeviceError(f"{file} is no YAML: {error}") from error
     if not isinstance(data, dict):
-        raise DeviceError(f"{file} must hold name, steering, throttle, brake and takeover: 'sb3-chac drive --calibrate {file}'.")
+        raise DeviceError(
+            f"{file} must hold name, steering, throttle, brake and takeover: 'sb3-chac drive --calibrate {file}'."
+        )
     _check_keys(str(file), data, {"name", "steering", "throttle", "brake", "takeover"}, {"pause", "skip"})
     parts: dict[str, Any] = {}
     for part, kind in (("steering", Steering), ("throttle", Pedal), ("brake", Pedal)):
@@ -369,7 +371,9 @@ def _part(where: str, data: Any, kind: type) -> Any:
         raise DeviceError(f"{where}: dead_zone must be from 0 to 0.9, got {part.dead_zone}.")
     if isinstance(part, Steering):
         if not (part.left < part.centre < part.right or part.left > part.centre > part.right):
-            raise DeviceError(f"{where}: centre must lie between left and right, got {part.left}, {part.centre}, {part.right}.")
+            raise DeviceError(
+                f"{where}: centre must lie between left and right, got {part.left}, {part.centre}, {part.right}."
+            )
         if part.exponent <= 0:
             raise DeviceError(f"{where}: exponent must be positive, got {part.exponent}.")
     elif part.released == part.pressed:

@@ -23,10 +23,14 @@ def check_drivable(env: gym.Env) -> None:
     """
     space = env.action_space
     if not (isinstance(space, spaces.Box) and space.shape == (2,) and np.isfinite([space.low, space.high]).all()):
-        raise NotDrivable(f"env: driving needs two bounded actions, steering and throttle or brake, {env.unwrapped} has {space}.")
+        raise NotDrivable(
+            f"env: driving needs two bounded actions, steering and throttle or brake, {env.unwrapped} has {space}."
+        )
     modes = env.metadata.get("render_modes") or []
     if "rgb_array" not in modes:
-        raise NotDrivable(f"env: the cockpit needs pictures, an environment with render_mode 'rgb_array', this one has {modes}.")
+        raise NotDrivable(
+            f"env: the cockpit needs pictures, an environment with render_mode 'rgb_array', this one has {modes}."
+        )
 
 
 class Person:
@@ -110,6 +114,6 @@ class Person:
     def __call__(self, observation: Any) -> np.ndarray:
         return self.action(self.input.steering, self.input.pedals)
 
-    def drives(self, observation: Any, novice_action: np.ndarray, expert_action: np.ndarray, human_driving: bool) -> bool:
+    def drives(self, observation: Any, novice_action: np.ndarray, expert_action: np.ndarray) -> bool:
         """The takeover rule: the person drives while it says so."""
         return self.input.takeover

@@ -12,7 +12,7 @@ from sb3_chac.cockpit.person import Person
 TO_BEGIN = "Ready: P begins"
 
 
-class DriveEnded(Exception):  # noqa: N818
+class DriveEnded(Exception):
     """Raised in the driving thread when the person has quit. The environment has not made the step."""
 
 
@@ -189,6 +189,4 @@ def lost_message(device: str) -> str:
     """
     if device == "keyboard":
         return "The window has lost the keyboard: click into it, then P goes on"
-    if device == "browser":
-        return "Nobody is at the wheel: connect and take it, then P goes on"
     return f"No {device}: plug it in, or press K for the keyboard; then P goes on"

@@ -80,9 +80,7 @@ class Window:
             pygame.display.init()
             self.screen = pygame.display.set_mode(SIZE)
         except pygame.error as error:
-            raise RuntimeError(
-                f"The cockpit's window could not be opened: {error}. On a machine without a display, use --serve 127.0.0.1:8000."
-            ) from error
+            raise RuntimeError(f"The cockpit's window could not be opened: {error}. It needs a display.") from error
         pygame.display.set_caption(title)
         pygame.font.init()
         pygame.event.set_blocked(pygame.MOUSEMOTION)
@@ -174,7 +172,9 @@ class Window:
         pygame.draw.rect(self.screen, HUMAN if display.takeover else EGO, (SIDE.left, 0, 6, SIDE.height))
         y = 24
         for name, value in indicators(display, lag):
-            colour = HUMAN if name == "takeover" and display.takeover else ORANGE if name.startswith("updates") and lag else TEXT
+            colour = (
+                HUMAN if name == "takeover" and display.takeover else ORANGE if name.startswith("updates") and lag else TEXT
+            )
             self._text(name, (SIDE.left + 24, y), self.font, DIM)
             self._text(value, (SIDE.right - 16, y), self.font, colour, "topright")
             y += 36
@@ -194,7 +194,12 @@ class Window:
         now = self.drive.person.read()
         rows = (
             ("proposed", "by the novice", display.proposed, EGO),
-            ("applied", "you drive" if display.takeover else "the novice's", display.applied, HUMAN if display.takeover else EGO),
+            (
+                "applied",
+                "you drive" if display.takeover else "the novice's",
+                display.applied,
+                HUMAN if display.takeover else EGO,
+            ),
             ("your input", self.drive.person.device.name, (now.steering, now.pedals), DIM),
         )
         for i, (name, who, (steering, pedals), colour) in enumerate(rows):
