@@ -34,7 +34,8 @@ DESCRIPTION = """Train with yourself as the human: watch the novice drive, take 
   sb3-chac drive --algo chac --env SafeDrive-v0 --device wheel        with a steering wheel (see --calibrate)
   sb3-chac drive --resume logs/chac/SafeDrive-v0_1                    go on, with all that was learned and driven
 
-Hyperparameters, run folders and files are those of 'rl_zoo3 train'. The drive is recorded as a dataset (see 'sb3-chac demos')."""
+Hyperparameters, run folders and files are those of 'rl_zoo3 train'. The drive is recorded as a dataset, see
+'sb3-chac demos'. The operator's guide is sb3_chac/cockpit/README.md."""
 
 SAVE_FREQ = 600  # steps: a minute
 
@@ -71,13 +72,11 @@ def make_parser() -> argparse.ArgumentParser:
         type=int,
         default=SAVE_FREQ,
         metavar="N",
-        help="steps between checkpoints, 0: at the end only (%(default)s)",
+        help="steps between checkpoints, 0: only at the end",
     )
     where.add_argument("--verbose", type=int, default=0, help="1: RL-Zoo3's and the logger's output (default: %(default)s)")
     other = parser.add_argument_group("in place of a new drive")
-    other.add_argument(
-        "--resume", type=Path, metavar="RUN_FOLDER", help="go on with this drive; other arguments override its own"
-    )
+    other.add_argument("--resume", type=Path, metavar="RUN_FOLDER", help="go on with this drive; other arguments override")
     other.add_argument("--recover", type=Path, metavar="RUN_FOLDER", help="make the dataset of a drive that was killed")
     other.add_argument("--calibrate", type=Path, metavar="FILE", help="find out what axes and buttons a device has")
     return parser
@@ -265,7 +264,7 @@ def calibrate(file: Path) -> None:
     calibration = Calibration(joystick.get_name())
     while calibration.step:
         button = calibration.step == "takeover"
-        print(calibration.question + ("." if button else ", then press Enter here."))
+        print(str(calibration.question) + ("." if button else ", then press Enter here."))
         if not button:
             input()
         while True:

@@ -150,7 +150,7 @@ class DrivenTraining(Base):
     # Two policies and two loggers: each thread has its own
 
     @property
-    def policy(self) -> Any:  # type: ignore[override]
+    def policy(self) -> Any:
         acts = "_this_thread" in self.__dict__ and getattr(self._this_thread, "acts", False)
         return self._driving_policy if acts else self._learning_policy
 
@@ -175,7 +175,7 @@ class DrivenTraining(Base):
     def refresh_driver(self) -> None:
         """The driving policy becomes what was learned."""
         with self._driving_lock:
-            th._foreach_copy_(*self._pairs)
+            th._foreach_copy_(self._pairs[0], self._pairs[1])
 
     # Learning
 
@@ -288,7 +288,7 @@ class DrivenTraining(Base):
             self.learner.start()
         return prepared
 
-    def learn(self, *args: Any, **kwargs: Any) -> Any:  # type: ignore[override]
+    def learn(self, *args: Any, **kwargs: Any) -> Any:
         """
         As the algorithm's, but it returns early when the person quits. Everything driven is stored then.
         """
@@ -299,6 +299,7 @@ class DrivenTraining(Base):
         except DriveEnded:
             self._callback.on_training_end()
         finally:
+            self.drive.busy = ""
             self.learner.stop()
         return self
 

@@ -141,7 +141,7 @@ class Recorder:
         file = self.folder / f"{self.number:06d}.npz"
         temporary = file.with_suffix(".tmp")
         with temporary.open("wb") as stream:
-            np.savez(stream, reset=np.array(self._reset), **columns)
+            np.savez(stream, reset=np.array(self._reset), **columns)  # type: ignore[arg-type]
         sync(temporary)
         temporary.rename(file)
         self.number += 1

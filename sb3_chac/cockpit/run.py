@@ -137,7 +137,7 @@ class DriveRun:
                 model, _ = self.manager.setup_experiment()  # type: ignore[misc]
         finally:
             ALGOS[args.algo] = algorithm
-        self._learn(model)
+        self._learn(model)  # type: ignore[arg-type]
 
     def _learn(self, model: DrivenTraining) -> None:
         args, manager = self.args, self.manager

@@ -66,8 +66,8 @@ class GuidedOffPolicyAlgorithm(CheckedOffPolicyAlgorithm):
 
     def store_demonstrations(self, dataset: str | os.PathLike[str] | Demonstrations) -> None:
         """
-        Puts a dataset into the replay buffer, as if it had been driven: what the human drove (all of it, if the dataset does not
-        say who drove) beside what the novice proposed, and the rest. It is not counted as steps of this training.
+        Puts a dataset into the replay buffer, as if it had been driven: what the human drove (all of it, if the dataset does
+        not say who drove) beside what the novice proposed, and the rest. It is not counted as steps of this training.
 
         :param dataset: id or folder of a dataset of Minari, or Demonstrations
         :raises DatasetError: if it is missing, damaged or does not fit

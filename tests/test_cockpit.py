@@ -1,0 +1,558 @@
+"""A person at the wheel: devices, the drive and what is kept of it. Everything is headless, the devices are emulated."""
+
+import os
+import threading
+import time
+
+os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
+
+import gymnasium as gym
+import numpy as np
+import pygame
+import pytest
+from guided_toys import make_guided
+from gymnasium import spaces
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+from sb3_chac import CHAC, DPVP, PVP, HGDagger
+from sb3_chac.__main__ import main
+from sb3_chac.cockpit.devices import (
+    GAMEPAD,
+    WHEEL,
+    Calibration,
+    Command,
+    DeviceError,
+    Joystick,
+    Keyboard,
+    load_config,
+    save_config,
+)
+from sb3_chac.cockpit.emulator import DeviceEmulator
+from sb3_chac.cockpit.env import Cockpit
+from sb3_chac.cockpit.learner import driven
+from sb3_chac.cockpit.person import NotDrivable, Person, check_drivable
+from sb3_chac.cockpit.recording import FOLDER, Recorder
+from sb3_chac.cockpit.session import Drive, DriveEnded
+from sb3_chac.cockpit.window import Window
+from sb3_chac.human import InterventionWrapper
+from sb3_chac.human.demonstrations import load_demonstrations
+
+
+class Clock:
+    now = 0.0
+
+    def __call__(self):
+        return self.now
+
+
+class Car(gym.Env):
+    """A point on a line: the pedals are its acceleration. ``executed`` lists the actions."""
+
+    metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012
+    observation_space = spaces.Box(-1e6, 1e6, (2,), np.float32)
+    action_space = spaces.Box(-1, 1, (2,), np.float32)
+    render_mode = "rgb_array"
+
+    def __init__(self, length=30):
+        self.length, self.executed = length, []
+
+    def reset(self, seed=None, options=None):
+        super().reset(seed=seed)
+        self.speed, self.steps = 3.0, 0
+        return self.obs(), {"speed": self.speed}
+
+    def obs(self):
+        return np.array([self.speed, self.steps], np.float32)
+
+    def step(self, action):
+        self.executed.append(np.array(action))
+        self.speed = max(self.speed + float(action[1]), 0.0)
+        self.steps += 1
+        return self.obs(), 1.0, self.steps == self.length, False, {"speed": self.speed, "cost": 0.5}
+
+    def render(self):
+        return np.zeros((6, 8, 3), np.uint8)
+
+
+def keyboard():
+    clock = Clock()
+    device = Keyboard(clock)
+    return clock, device, DeviceEmulator(device.handle)
+
+
+def wheel(config=WHEEL):
+    clock = Clock()
+    emulator = DeviceEmulator(lambda event: answers.append(device.handle(event)))
+    answers: list = []
+    device = Joystick(config, clock, emulator.open_joystick)
+    emulator.plug()
+    return device, emulator, answers
+
+
+def cockpit(tmp_path, device, car=None, rate=1000.0):
+    drive = Drive(Person(device), rate)
+    car = car or Car()
+    watched = InterventionWrapper(car, drive.person, drive.person.drives)
+    env = Cockpit(watched, drive, Recorder(tmp_path, car, str(tmp_path / "drive-v0"), "test", 0.1))
+    drive.go_on()
+    return env, drive, car
+
+
+# Devices
+
+
+def test_held_keys_ramp_up_and_return_to_the_middle():
+    clock, device, person = keyboard()
+    person.press(pygame.K_LEFT)
+    person.press(pygame.K_UP)
+    steering = []
+    for clock.now in (0.1, 0.2, 1.0):
+        steering.append(device.read().steering)
+    assert 0 > steering[0] > steering[1] > steering[2] == -1
+    assert device.read().pedals == 1 and device.read().takeover
+    person.release(pygame.K_LEFT)
+    person.release(pygame.K_UP)
+    clock.now += 0.1
+    assert -1 < device.read().steering < 0 < device.read().pedals < 1
+    clock.now += 1
+    assert device.read()[:2] == (0, 0)
+    assert device.read().takeover  # letting go is not handing back
+
+
+def test_brake_is_stronger_than_throttle_and_faster():
+    clock, device, person = keyboard()
+    person.press(pygame.K_UP)
+    clock.now = 0.1
+    throttle = device.read().pedals
+    person.press(pygame.K_DOWN)
+    clock.now = 0.2
+    assert device.read().pedals < -throttle < 0
+
+
+def test_a_short_tap_between_two_looks_is_not_lost():
+    clock, device, person = keyboard()
+    clock.now = 0.01
+    person.press(pygame.K_RIGHT)
+    clock.now = 0.04
+    person.release(pygame.K_RIGHT)
+    assert device.read().steering > 0.05 and device.read().takeover
+
+
+def test_space_takes_over_and_hands_back():
+    _, device, person = keyboard()
+    seen = []
+    for _ in range(2):
+        person.tap(pygame.K_SPACE)
+        seen.append(device.read().takeover)
+    assert seen == [True, False]
+
+
+def test_keyboard_is_lost_with_the_focus_and_no_key_stays_held():
+    clock, device, person = keyboard()
+    person.press(pygame.K_UP)
+    clock.now = 1
+    person.lose_focus()
+    assert not device.read().connected and device.read().pedals == 0
+    person.gain_focus()
+    clock.now = 2
+    assert device.read().connected and device.read().pedals == 0
+
+
+def test_wheel_pedals_paddle_and_unplugging():
+    device, emulator, answers = wheel()
+    assert device.read()[:4] == (0, 0, False, True)  # SDL tells nothing of pedals that nobody touched
+    emulator.axis(0, 0.5)
+    emulator.axis(2, -1.0)
+    assert device.read().steering == pytest.approx(0.49, abs=0.01) and device.read().pedals == 1
+    emulator.axis(3, -1.0)
+    assert device.read().pedals == -1
+    emulator.button(5)
+    assert device.read().takeover
+    emulator.button(9)
+    assert answers[-2] is Command.PAUSE
+    emulator.unplug()
+    assert not device.read().connected
+    emulator.plug()
+    assert device.read()[:2] == (0, 0) and device.read().connected
+
+
+def test_gamepad_has_a_dead_zone_and_others_are_not_listened_to():
+    device, emulator, _ = wheel(GAMEPAD)
+    emulator.axis(0, -0.1)
+    assert device.read().steering == 0
+    device.handle(pygame.event.Event(pygame.JOYAXISMOTION, instance_id=99, axis=0, value=1.0))
+    assert device.read().steering == 0
+
+
+def test_calibration_finds_axes_and_is_read_back(tmp_path):
+    calibration = Calibration("my wheel")
+    person = DeviceEmulator(calibration.handle)
+    script = {
+        "left": [(1, 0.9)],
+        "right": [(1, -0.9)],
+        "centre": [(1, 0.02)],
+        "throttle": [(3, -1.0)],
+        "released": [(3, 1.0)],
+        "brake": [(4, -0.8)],
+    }
+    for axes in script.values():
+        for axis, value in axes:
+            person.axis(axis, value)
+        calibration.answer()
+    assert calibration.step == "takeover"
+    person.button(7)
+    save_config(tmp_path / "wheel.yml", calibration.config())
+    config = load_config(tmp_path / "wheel.yml")
+    assert config == calibration.config()
+    assert config.steering.value(0.9) == -1 and config.steering.value(-0.9) == 1
+    assert (config.throttle.axis, config.brake.axis, config.takeover) == (3, 4, (7,))
+    assert config.throttle.value(-1.0) == 1 and config.throttle.value(1.0) == 0 and config.brake.value(1.0) == 0
+
+
+def test_calibration_asks_again_when_nothing_moved():
+    calibration = Calibration("wheel")
+    DeviceEmulator(calibration.handle).axis(0, -1.0)
+    calibration.answer()
+    with pytest.raises(DeviceError, match="No axis moved"):
+        calibration.answer()
+    assert calibration.step == "right"
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        (("takeover:\n- 4\n- 5", "takeover: []"), "takeover must name a button"),
+        (("axis: 0", "axis: x"), "axis must be a number"),
+        (("centre: 0.0", "centre: 2.0"), "centre must lie between"),
+        (("name:", "nam:"), "lacks name"),
+        (("dead_zone: 0.02", "dead_zone: 3"), "dead_zone must be"),
+    ],
+)
+def test_a_bad_configuration_is_named(tmp_path, change, message):
+    file = tmp_path / "wheel.yml"
+    save_config(file, WHEEL)
+    text = file.read_text()
+    assert change[0] in text
+    file.write_text(text.replace(*change))
+    with pytest.raises(DeviceError, match=message):
+        load_config(file)
+
+
+# The drive
+
+
+def test_person_drives_in_the_bounds_of_the_environment():
+    _, device, _ = keyboard()
+    person = Person(device)
+    person.sit_in(spaces.Box(np.array([-2, 0], np.float32), np.array([2, 10], np.float32)), steers_left=True)
+    assert person.action(1.0, -1.0).tolist() == [-2, 0] and person.action(-1.0, 1.0).tolist() == [2, 10]
+    assert person.as_input(np.array([-1.0, 5.0])) == (0.5, 0.0)
+
+
+def test_what_cannot_be_driven_is_refused():
+    with pytest.raises(NotDrivable, match="two bounded actions"):
+        check_drivable(gym.make("Pendulum-v1"))
+
+
+def test_takeover_and_hand_back(tmp_path):
+    clock, device, person = keyboard()
+    env, _, car = cockpit(tmp_path, device)
+    env.env.arm()
+    env.reset(seed=1)
+    novice = np.array([0.25, 0.25], np.float32)
+    assert not env.step(novice)[4]["takeover"]
+    person.press(pygame.K_RIGHT)
+    clock.now = 5
+    assert env.step(novice)[4]["takeover"]
+    person.release(pygame.K_RIGHT)
+    person.tap(pygame.K_SPACE)
+    assert not env.step(novice)[4]["takeover"]
+    assert np.allclose(car.executed, [novice, [1, 0], novice])
+
+
+def test_never_faster_than_real_time(tmp_path):
+    _, device, _ = keyboard()
+    env, drive, _ = cockpit(tmp_path, device, rate=100.0)
+    env.reset(seed=0)
+    times = []
+    for i in range(10):
+        if i == 5:
+            time.sleep(0.03)  # what is late is not caught up
+        env.step(np.zeros(2, np.float32))
+        times.append(drive._next_tick)
+    assert np.diff(times).min() >= 0.01
+
+
+def test_unplugging_in_a_takeover_brakes_and_pauses(tmp_path):
+    device, emulator, _ = wheel()
+    env, drive, car = cockpit(tmp_path, device)
+    env.env.arm()
+    env.reset(seed=1)
+    emulator.button(4)
+    env.step(np.zeros(2, np.float32))
+    emulator.unplug()
+    results: list = []
+    thread = threading.Thread(target=lambda: results.append(env.step(np.zeros(2, np.float32))))
+    thread.start()
+    wait_until(lambda: drive.paused)
+    assert car.speed == 0 and "Braked. No wheel" in drive.message and not results
+    drive.go_on()
+    assert drive.paused  # nothing to take over with
+    emulator.plug()
+    drive.go_on()
+    thread.join(5)
+    _, _, terminated, truncated, info = results[0]
+    assert truncated and not terminated and info["unattended"]
+    assert not drive.person.read().takeover
+    env.recorder.finish()
+    assert len(load_demonstrations(tmp_path / "drive-v0")) == 1  # what the brake did is not recorded
+
+
+def test_losing_the_device_while_the_novice_drives_pauses_without_braking(tmp_path):
+    device, emulator, _ = wheel()
+    env, drive, car = cockpit(tmp_path, device)
+    env.reset(seed=1)
+    emulator.unplug()
+    ended: list = []
+
+    def step():
+        try:
+            env.step(np.zeros(2, np.float32))
+        except DriveEnded as error:
+            ended.append(error)
+
+    thread = threading.Thread(target=step)
+    thread.start()
+    wait_until(lambda: drive.paused)
+    assert car.executed == []
+    drive.quit()
+    thread.join(5)
+    assert ended and car.executed == []
+
+
+def test_a_skipped_episode_is_truncated(tmp_path):
+    _, device, _ = keyboard()
+    env, drive, _ = cockpit(tmp_path, device)
+    env.reset(seed=1)
+    drive.pause()
+    drive.skip()  # works in a pause, too
+    assert env.step(np.zeros(2, np.float32))[2:4] == (False, True)
+    assert drive.paused
+
+
+def wait_until(condition, seconds=10.0):
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "it did not happen"
+        time.sleep(0.002)
+
+
+# Learning beside the drive
+
+
+def make_driven(algorithm, tmp_path, device=None, car=None, rate=1000.0, **kwargs):
+    env, drive, car = cockpit(tmp_path, device or keyboard()[1], car, rate)
+    model = make_guided(driven(algorithm), DummyVecEnv([lambda: env]), **kwargs)
+    model.attach(drive)
+    return model, drive, env
+
+
+@pytest.mark.parametrize("algorithm", [PVP, DPVP, CHAC])
+def test_as_many_updates_as_the_algorithm_makes(algorithm, tmp_path):
+    model, _, env = make_driven(algorithm, tmp_path, train_freq=2, gradient_steps=3)
+    model.learn(60)
+    assert model._n_updates == 3 * len(range(22, 61, 2)) and model.owed_steps == 0
+    assert model.replay_buffer.size() == 60
+    for driving, learned in zip(*model._pairs, strict=True):
+        assert (driving == learned).all()
+    env.recorder.finish()
+
+
+def test_slow_updates_do_not_hold_up_the_drive(tmp_path):
+    model, drive, _ = make_driven(DPVP, tmp_path, rate=50.0)
+    train_now = model.train_now
+
+    def slowly(*args):
+        time.sleep(0.25)
+        train_now(*args)
+
+    model.train_now = slowly
+    timer = threading.Timer(1.5, drive.quit)
+    begun = time.monotonic()
+    timer.start()
+    model.learn(10_000)
+    rate = model.num_timesteps / (min(time.monotonic() - begun, 1.5))
+    assert rate > 40 and drive.lag > 30  # one update takes as long as 12 steps
+
+
+def test_an_error_of_an_update_ends_the_drive(tmp_path):
+    model, _, _ = make_driven(DPVP, tmp_path)
+
+    def fail(*args):
+        raise ArithmeticError("broken")
+
+    model.train_now = fail
+    with pytest.raises(ArithmeticError, match="broken"):
+        model.learn(1000)
+
+
+def test_stage_2_is_prepared_while_the_car_waits_and_the_person_may_still_take_over(tmp_path):
+    _, device, person = keyboard()
+    model, drive, env = make_driven(CHAC, tmp_path, device, switch_after=30, prefit_steps=4)
+    fits, update = [], model._update_confidence_critic
+
+    def witnessed(batch):
+        if threading.current_thread() is not model.learner:
+            fits.append(drive.busy)
+            if len(fits) == 4:
+                person.tap(pygame.K_SPACE)
+        return update(batch)
+
+    model._update_confidence_critic = witnessed
+    model.learn(50)
+    assert model.stage == 2 and fits == ["The car waits: C-HAC prepares stage 2"] * 4 and drive.busy == ""
+    assert 10 < model.counts["human_steps"] < 25  # none before the switch
+    assert drive.novice.stage == "2: self-learning" and 0 <= drive.novice.confidence <= 1
+    env.recorder.finish()
+
+
+def test_what_is_saved_is_the_algorithms(tmp_path):
+    model, _, env = make_driven(DPVP, tmp_path)
+    model.learn(40)
+    model.save(tmp_path / "model.zip")
+    loaded = DPVP.load(tmp_path / "model.zip")
+    observation = np.zeros(2, np.float32)
+    assert type(loaded) is DPVP
+    assert np.array_equal(
+        loaded.predict(observation, deterministic=True)[0], model.predict(observation, deterministic=True)[0]
+    )
+    env.recorder.finish()
+
+
+def test_the_unattended_brake_is_not_learned_from(tmp_path):
+    device, emulator, _ = wheel()
+    model, drive, env = make_driven(DPVP, tmp_path, device, rate=200.0)
+    thread = threading.Thread(target=lambda: model.learn(10_000), daemon=True)
+    thread.start()
+    wait_until(lambda: drive.display.total_steps >= 2)
+    emulator.button(4)
+    wait_until(lambda: drive.display.human_steps >= 3)
+    emulator.unplug()
+    wait_until(lambda: drive.paused)
+    drive.quit()
+    thread.join(10)
+    summary = env.recorder.finish()
+    assert model.replay_buffer.size() == summary.steps
+    assert (model.replay_buffer.human.arrays["action"][: summary.human_steps, 1] == 0).all()  # the person did not brake
+
+
+# Recordings
+
+
+def test_recording_survives_a_kill_up_to_the_last_episode(tmp_path):
+    _, device, _ = keyboard()
+    env, _, _ = cockpit(tmp_path, device, Car(length=4))
+    for _ in range(2):
+        env.reset()
+        while not env.step(np.zeros(2, np.float32))[2]:
+            pass
+    env.reset()
+    env.step(np.zeros(2, np.float32))  # of the third nothing is on the disk
+    assert sorted(file.name for file in (tmp_path / FOLDER).glob("*.npz")) == ["000000.npz", "000001.npz"]
+
+
+def test_a_drive_is_a_dataset_to_learn_from(tmp_path):
+    _, device, person = keyboard()
+    env, _, _ = cockpit(tmp_path, device, Car(length=6))
+    env.env.arm()
+    novice = np.array([0.25, 0.0], np.float32)
+    env.reset(seed=1)
+    for step in range(6):
+        if step in (2, 4):
+            person.tap(pygame.K_SPACE)
+        env.step(novice)
+    summary = env.recorder.finish()
+    assert (summary.episodes, summary.steps, summary.human_steps, summary.takeovers) == (1, 6, 2, 1)
+    assert (summary.cost, summary.human_cost, summary.mean_takeover_steps) == (3.0, 1.0, 2.0)
+    data = load_demonstrations(tmp_path / "drive-v0")
+    assert data.takeovers.tolist() == [False, False, True, True, False, False]
+    assert np.allclose(data.novice_actions, novice) and np.allclose(data.actions[2:4], 0)
+
+    for algorithm in (DPVP, CHAC):
+        model = make_guided(algorithm)
+        model.observation_space = data.observation_space
+        model.store_demonstrations(data)
+        assert (len(model.replay_buffer.human), len(model.replay_buffer.novice)) == (2, 4)
+        assert model.replay_buffer.human.arrays["takeover_start"][:2, 0].tolist() == [1, 0]
+        assert np.allclose(model.replay_buffer.human.arrays["novice_action"][:2], novice)
+    dagger = HGDagger("MlpPolicy", DummyVecEnv([Car]), dataset=data)
+    assert dagger.demonstrated_rows == 2
+
+
+# The command
+
+
+def test_drive_with_keys_then_resume_and_replay(tmp_path, monkeypatch, capsys):
+    """The whole command: a window, a takeover with keys, quit; then the drive goes on where it was."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
+    frames = play(monkeypatch, [(5, pygame.K_UP), (12, pygame.K_q)])
+    main_with(monkeypatch, "drive", "--algo", "pvp", "--seed", "1", "--device", "keyboard", "--rate", "50", "--go")
+    printed = capsys.readouterr().out
+    assert "in 1 takeovers" in printed and "--resume logs/pvp/SafeDrive-v0_1" in printed and len(frames) > 0
+
+    play(monkeypatch, [(20, pygame.K_q)])
+    main_with(monkeypatch, "drive", "--resume", "logs/pvp/SafeDrive-v0_1", "--dataset", "drives/second-v0")
+    capsys.readouterr()
+    model = PVP.load("logs/pvp/SafeDrive-v0_2/SafeDrive-v0.zip")
+    assert model.counts["total_steps"] >= 20 and model.counts["human_steps"] >= 5
+    model.load_replay_buffer(next(iter((tmp_path / "logs/pvp/SafeDrive-v0_2/checkpoints").glob("*/replay_buffer.pkl"))))
+    assert model.replay_buffer.size() == model.counts["total_steps"]
+
+    main_with(monkeypatch, "demos", "replay", "--dataset", "drives/second-v0")
+    assert "the returns differ by 0, the observations by 0" in capsys.readouterr().out
+
+
+def play(monkeypatch, script):
+    """
+    :param script: (total steps of the training at which a key is pressed, key)
+    """
+    todo, frames, draw = list(script), [], Window.draw
+
+    def draw_and_press(window):
+        draw(window)
+        frames.append(pygame.surfarray.array3d(window.screen).std())
+        if todo and window.drive.display.total_steps >= todo[0][0]:
+            DeviceEmulator().press(todo.pop(0)[1])
+
+    monkeypatch.setattr(Window, "draw", draw_and_press)
+    return frames
+
+
+def main_with(monkeypatch, *arguments):
+    monkeypatch.setattr("sys.argv", ["sb3-chac", *arguments])
+    main()
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        (["--algo", "sac_lag"], "does not learn from takeovers, choose from"),
+        (["--env", "Nowhere-v0"], "gymnasium knows no 'Nowhere-v0'"),
+        (["--env", "Pendulum-v1"], "two bounded actions"),
+        (["--pretrain", "5"], "--pretrain needs --demos"),
+        (["--rate", "0"], "--rate must be from"),
+        (["--config", "nothing.yml"], "nothing.yml cannot be read"),
+        (["--resume", "nowhere"], "there is no such folder"),
+        (["--recover", "nowhere"], "holds no recording"),
+        (["--demos", "none/none-v0"], "There is no dataset 'none/none-v0'"),
+    ],
+)
+def test_wrong_arguments_get_one_message(arguments, message, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
+    monkeypatch.delenv("SB3_CHAC_TRACEBACK", raising=False)
+    with pytest.raises(SystemExit) as ended:
+        main_with(monkeypatch, "drive", *arguments)
+    assert ended.value.code == 2
+    assert message in capsys.readouterr().err
