@@ -396,22 +396,25 @@ def test_an_error_of_an_update_ends_the_drive(tmp_path):
         model.learn(1000)
 
 
-def test_stage_2_is_prepared_while_the_car_waits_and_the_person_may_still_take_over(tmp_path):
+def test_stage_2_is_prepared_beside_the_drive_and_the_person_may_still_take_over(tmp_path):
     _, device, person = keyboard()
-    model, drive, env = make_driven(CHAC, tmp_path, device, switch_after=30, prefit_steps=4)
-    fits, update = [], model._update_confidence_critic
+    model, drive, env = make_driven(CHAC, tmp_path, device, rate=100.0, switch_after=30, prefit_steps=20)
+    prefit_step, prepared = model._prefit_step, []
 
-    def witnessed(batch):
-        if threading.current_thread() is not model.learner:
-            fits.append(drive.busy)
-            if len(fits) == 4:
-                person.tap(pygame.K_SPACE)
-        return update(batch)
+    def witnessed():
+        time.sleep(0.01)  # a step of the environment takes as long
+        prepared.append((threading.current_thread() is model.learner, drive.busy, drive.display.total_steps))
+        if len(prepared) == 10:
+            person.tap(pygame.K_SPACE)
+        prefit_step()
 
-    model._update_confidence_critic = witnessed
-    model.learn(50)
-    assert model.stage == 2 and fits == ["The car waits: C-HAC prepares stage 2"] * 4 and drive.busy == ""
-    assert 10 < model.counts["human_steps"] < 25  # none before the switch
+    model._prefit_step = witnessed
+    model.learn(80)
+    assert model.stage == 2 and len(prepared) == 20 and model.owed_steps == 0
+    assert all(is_beside and not busy for is_beside, busy, _ in prepared)
+    assert prepared[0][2] >= 30 and prepared[-1][2] > prepared[0][2] + 5  # stage 1 went on meanwhile
+    assert model._n_updates == 80 - model.learning_starts
+    assert 10 < model.counts["human_steps"] < 50  # none before the switch, until the episode ended
     assert drive.novice.stage == "2: self-learning" and 0 <= drive.novice.confidence <= 1
     env.recorder.finish()
 

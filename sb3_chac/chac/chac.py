@@ -346,15 +346,21 @@ class CHAC(DPVP):
         :return: mean of log pi_g over a batch
         """
         with th.no_grad():
-            batch = super()._sample_batch(self.batch_size)
+            batch = self._sample_batch(self.batch_size)
             return self.actor.action_log_prob(batch.observations)[1].mean().item()
 
     def _start_stage_2(self) -> None:
-        self._disarm()
-        self.policy.set_training_mode(True)
         for _ in range(self.prefit_steps):
-            self._update_confidence_critic(super()._sample_batch(self.batch_size))
+            self._prefit_step()
+        self._switch_to_stage_2()
+
+    def _prefit_step(self) -> None:
+        self.policy.set_training_mode(True)
+        self._update_confidence_critic(self._sample_batch(self.batch_size))
         self.policy.set_training_mode(False)
+
+    def _switch_to_stage_2(self) -> None:
+        self._disarm()
         self.policy.start_stage_2()
         self._show_stage()
         if self.verbose > 0:

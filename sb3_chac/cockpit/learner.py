@@ -202,32 +202,11 @@ class DrivenTraining(Base):
         with self._buffer_lock:
             return super()._sample_batch(batch_size)  # type: ignore[misc]
 
-    @contextmanager
-    def _car_waits(self, why: str) -> Iterator[None]:
-        """
-        Long work between two steps of the environment.
-
-        :param why: is shown
-        """
-        self.drive.busy = why
-        try:
-            self.learner.drain()
-            with self.learner.resting():
-                yield
-            self.refresh_driver()
-        finally:
-            self.drive.busy = ""
-
-    def _start_stage_2(self) -> None:
-        with self._car_waits("The car waits: C-HAC prepares stage 2"):
-            super()._start_stage_2()  # type: ignore[misc]
-        self._arm()  # who sits at the wheel may go on taking over
-        self._tell()
-
-    def _needs_human(self) -> bool:
-        return True
-
     # Driving
+
+    @property
+    def stage_name(self) -> str:
+        return "you guide"
 
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
@@ -244,14 +223,10 @@ class DrivenTraining(Base):
     def _tell(self) -> None:
         """What the display shows of the novice."""
         choice = getattr(self.policy, "last_choice", None)
-        if isinstance(self, HGDagger):
-            stage = f"round {self.round}" if self.round else "warm-up: you drive"
-        elif isinstance(self, CHAC):
-            stage = "2: self-learning" if self.stage == 2 else "1: you guide"
-        else:
-            stage = "you guide"
         self.drive.novice = (
-            Novice(stage) if choice is None else Novice(stage, bool(choice.self_drives[0]), float(choice.confidence[0]))
+            Novice(self.stage_name)
+            if choice is None
+            else Novice(self.stage_name, bool(choice.self_drives[0]), float(choice.confidence[0]))
         )
         self.drive.show(novice=self.drive.novice)
 
@@ -313,14 +288,67 @@ class DrivenTraining(Base):
             super().save(*args, **kwargs)
 
 
+class DrivenStages(DrivenTraining):
+    """
+    ``DrivenTraining`` of C-HAC: the fit of Z_c at the end of stage 1 is made beside the driving, too. Stage 1 goes on until it
+    is done. Who sits at the wheel may take over in stage 2 as well.
+    """
+
+    steps_before_prefit = 0  # gradient steps that were owed when it was due
+    prefit_left: int | None = None  # None: it is not due
+
+    def train_now(self, gradient_steps: int, batch_size: int) -> None:
+        if not self.prefit_left:
+            super().train_now(gradient_steps, batch_size)
+        elif self.steps_before_prefit:
+            super().train_now(gradient_steps, batch_size)
+            self.steps_before_prefit -= 1
+        else:
+            self._prefit_step()  # type: ignore[attr-defined]
+            self.prefit_left -= 1
+
+    def _start_stage_2(self) -> None:
+        """Is called after each step of the environment as long as it is due."""
+        if self.prefit_left is None:
+            self.steps_before_prefit, self.prefit_left = self.owed_steps, self.prefit_steps  # type: ignore[attr-defined]
+            self.learner.owe(self.prefit_steps)  # type: ignore[attr-defined]
+        if self.prefit_left == 0:
+            with self.learner.resting():
+                self._switch_to_stage_2()  # type: ignore[attr-defined]
+            self.refresh_driver()
+            self._arm()
+
+    def _needs_human(self) -> bool:
+        return True
+
+    @property
+    def stage_name(self) -> str:
+        if self.stage == 2:  # type: ignore[attr-defined]
+            return "2: self-learning"
+        return "1: you guide" if self.prefit_left is None else "1: prepares 2"
+
+
 class DrivenRounds(DrivenTraining):
-    """``DrivenTraining`` of HG-DAgger and IWR: the novice is fitted between the rounds, where the algorithm does it."""
+    """
+    ``DrivenTraining`` of HG-DAgger and IWR: the novice is fitted between the rounds, where the algorithm does it. The car
+    waits meanwhile, and the display says so.
+    """
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
         assert isinstance(self, HGDagger)
         if self._is_round_over() or self.num_timesteps >= self._total_timesteps:
-            with self._car_waits("The car waits: the novice is fitted to what you drove"):
-                self.train_now(gradient_steps, batch_size)
+            self.drive.busy = "The car waits: the novice is fitted to what you drove"
+            try:
+                with self.learner.resting():
+                    self.train_now(gradient_steps, batch_size)
+                self.refresh_driver()
+            finally:
+                self.drive.busy = ""
+
+    @property
+    def stage_name(self) -> str:
+        assert isinstance(self, HGDagger)
+        return f"round {self.round}" if self.round else "warm-up: you drive"
 
 
 @functools.cache
@@ -329,5 +357,8 @@ def driven(algorithm: type[GuidedOffPolicyAlgorithm]) -> type[Any]:
     :param algorithm: that learns from takeovers
     :return: the same algorithm for a drive, see ``DrivenTraining``; what it saves is the algorithm's
     """
-    base = DrivenRounds if issubclass(algorithm, HGDagger) else DrivenTraining
+    base = DrivenTraining
+    for special, general in ((DrivenStages, CHAC), (DrivenRounds, HGDagger)):
+        if issubclass(algorithm, general):
+            base = special
     return type(f"Driven{algorithm.__name__}", (base, algorithm), {})
