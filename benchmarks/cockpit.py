@@ -178,10 +178,41 @@ def report() -> None:
         print(f"  gradient steps owed: median {np.median(lag):.0f}, most {lag.max()}, at the end {lag[-1]}")
 
 
+def pictures() -> None:
+    """Writes those of the operator's guide: trained agents drive, the person takes over."""
+    for name, algo, keys in (("takeover", "dpvp", [pygame.K_DOWN, pygame.K_RIGHT]), ("stage-2", "chac", [])):
+        agent = Path(__file__).parent / "agents" / f"{algo}-SafeDrive-v0.zip"
+        with tempfile.TemporaryDirectory() as folder:
+            window = Window("picture")
+            run = make_run("SafeDrive-v0", folder, "--algo", algo, "--trained-agent", str(agent))
+
+            def is_over(run: DriveRun = run, window: Window = window, keys: list[int] = keys, name: str = name) -> bool:
+                display = run.drive.display
+                while keys and display.number >= 60:
+                    DeviceEmulator().press(keys.pop())
+                if display.number >= 64 and (display.takeover or display.novice.self_drives) and not run.drive.ended:
+                    window.draw()
+                    pygame.image.save(window.screen, PICTURES / f"{name}.png")
+                    run.drive.quit()
+                return run.is_over
+
+            run.drive.go_on()
+            window.help = False
+            run.thread.start()
+            window.run(run.drive, is_over)
+            run.thread.join()
+            window.close()
+            if run.error is not None:
+                raise run.error
+
+
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("command", choices=["drive", "report"])
+    parser.add_argument("command", choices=["drive", "report", "pictures"])
     parser.add_argument("--env", default="SafeDrive-v0", metavar="ID")
     parser.add_argument("--minutes", type=float, default=10.0)
     arguments = parser.parse_args()
-    report() if arguments.command == "report" else measure(arguments.env, arguments.minutes)
+    if arguments.command == "drive":
+        measure(arguments.env, arguments.minutes)
+    else:
+        {"report": report, "pictures": pictures}[arguments.command]()

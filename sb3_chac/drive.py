@@ -52,6 +52,7 @@ def make_parser() -> argparse.ArgumentParser:
     what.add_argument("--conf-file", metavar="FILE", help="other hyperparameters file")
     what.add_argument("-n", "--n-timesteps", type=int, default=-1, metavar="N", help="steps in all (default: the yaml's)")
     what.add_argument("--seed", type=int, default=-1, help="default: a random one")
+    what.add_argument("-i", "--trained-agent", default="", metavar="MODEL", help="begin with this model (.zip)")
     what.add_argument("--demos", default="", metavar="ID", help="begin with what this dataset holds")
     what.add_argument("--pretrain", type=int, default=0, metavar="N", help="gradient steps on it before the drive")
     how = parser.add_argument_group("how it is driven")
@@ -123,7 +124,6 @@ def run(args: argparse.Namespace, arguments: list[str]) -> None:
     from sb3_chac.cockpit.recording import finish_recording
     from sb3_chac.resume import NotResumable, find_training
 
-    model = ""
     if args.resume:
         try:
             command, checkpoint = find_training(args.resume)
@@ -136,11 +136,11 @@ def run(args: argparse.Namespace, arguments: list[str]) -> None:
             print(f"What the drive that was interrupted had recorded:\n{left_behind}\n")
         arguments = [*command[1:], *without_resume(arguments)]
         args = make_parser().parse_args(arguments)
-        model = str(checkpoint)
+        args.trained_agent = str(checkpoint)
     check_arguments(args)
     # What RL-Zoo3 writes into the run folder, and 'sb3-chac resume' repeats
     sys.argv[1:] = ["drive", *arguments]
-    drive(args, model)
+    drive(args)
 
 
 def without_resume(arguments: list[str]) -> list[str]:
@@ -175,6 +175,8 @@ def check_arguments(args: argparse.Namespace) -> None:
     for option, low in (("pretrain", 0), ("save_freq", 0)):
         if getattr(args, option) < low:
             raise NotDrivable(f"--{option.replace('_', '-')} must be at least {low}, got {getattr(args, option)}.")
+    if args.trained_agent and not Path(args.trained_agent).is_file():
+        raise NotDrivable(f"--trained-agent: there is no file {args.trained_agent}.")
     if args.pretrain and not args.demos:
         raise NotDrivable("--pretrain needs --demos: there is nothing to learn from before the drive.")
     if args.rate is not None and not 0.5 <= args.rate <= 100:
@@ -190,16 +192,15 @@ def check_arguments(args: argparse.Namespace) -> None:
         args.dataset = f"drives/{args.algo}-{env}-{time.strftime('%Y%m%d-%H%M%S')}-v0"
 
 
-def drive(args: argparse.Namespace, model: str) -> None:
+def drive(args: argparse.Namespace) -> None:
     """
     :param args: see ``make_parser``, checked
-    :param model: checkpoint to go on from, or ""
     """
     from sb3_chac.cockpit.run import DriveRun
     from sb3_chac.cockpit.window import Window
 
     window = Window(f"sb3_chac: {args.algo} on {args.env}")
-    drive_run = DriveRun(args, find_device(args), model)
+    drive_run = DriveRun(args, find_device(args))
     try:
         drive_run.thread.start()
         if args.go:

@@ -62,7 +62,7 @@ class DriveManager(ExperimentManager):
     :param wrap: puts the person and the cockpit around the environment
     """
 
-    def __init__(self, wrap: Callable[[gym.Env], gym.Env], args: argparse.Namespace, model: str) -> None:
+    def __init__(self, wrap: Callable[[gym.Env], gym.Env], args: argparse.Namespace) -> None:
         super().__init__(
             args,
             args.algo,
@@ -73,7 +73,7 @@ class DriveManager(ExperimentManager):
             save_freq=0,
             hyperparams={**args.hyperparams, "n_envs": 1},
             env_kwargs={**args.env_kwargs, "render_mode": "rgb_array"},
-            trained_agent=model,
+            trained_agent=args.trained_agent,
             seed=args.seed,
             log_interval=1,
             verbose=args.verbose,
@@ -101,12 +101,11 @@ class DriveRun:
 
     :param args: of the command line, see ``sb3_chac.drive``
     :param device: that the person holds
-    :param model: checkpoint to go on from, "" for a new training
     """
 
-    def __init__(self, args: argparse.Namespace, device: Device, model: str = "") -> None:
+    def __init__(self, args: argparse.Namespace, device: Device) -> None:
         register()
-        self.args, self.checkpoint_to_load = args, model
+        self.args = args
         self.drive = Drive(Person(device), args.rate or DEFAULT_RATE)
         self.summary: Summary | None = None
         self.run_folder: Path | None = None
@@ -131,7 +130,7 @@ class DriveRun:
         algorithm = drivable_algorithms()[args.algo]
         ALGOS[args.algo] = driven(algorithm)
         try:
-            self.manager = DriveManager(self._wrap, args, self.checkpoint_to_load)
+            self.manager = DriveManager(self._wrap, args)
             self.run_folder = Path(self.manager.save_path)
             with contextlib.redirect_stdout(io.StringIO()) if args.verbose == 0 else contextlib.nullcontext():
                 model, _ = self.manager.setup_experiment()  # type: ignore[misc]

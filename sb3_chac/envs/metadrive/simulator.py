@@ -3,6 +3,7 @@
 import importlib.util
 import logging
 import os
+import threading
 import weakref
 from typing import TYPE_CHECKING, Any
 
@@ -89,6 +90,10 @@ def make_simulator(owner: Any, config: dict[str, Any]) -> "SafeMetaDriveEnv":
     handlers, level = list(root.handlers), root.level
     from metadrive.envs.safe_metadrive_env import SafeMetaDriveEnv
 
+    if threading.current_thread() is not threading.main_thread():
+        from direct.task import Task
+
+        Task.signal = None  # Panda3D would set a signal handler in each step, which only the main thread may
     simulator = SafeMetaDriveEnv(config | {"log_level": logging.ERROR})
     root.handlers, root.level = handlers, level  # MetaDrive's modules call logging.basicConfig
     _owner = weakref.ref(owner)
