@@ -1,6 +1,7 @@
 """``python -m sb3_chac drive``: train with a person at the wheel."""
 
 import argparse
+import asyncio
 import os
 import re
 import shlex
@@ -32,6 +33,7 @@ DESCRIPTION = """Train with yourself as the human: watch the novice drive, take 
 
   sb3-chac drive --algo chac --env SafeDrive-v0                       in a window, with the keyboard
   sb3-chac drive --algo chac --env SafeDrive-v0 --device wheel        with a steering wheel (see --calibrate)
+  sb3-chac drive --algo chac --env SafeDrive-v0 --serve 8000          in a browser, with keyboard or gamepad
   sb3-chac drive --resume logs/chac/SafeDrive-v0_1                    go on, with all that was learned and driven
 
 Hyperparameters, run folders and files are those of 'rl_zoo3 train'. The drive is recorded as a dataset, see
@@ -59,6 +61,7 @@ def make_parser() -> argparse.ArgumentParser:
     how.add_argument(
         "--device", default="auto", choices=("auto", "keyboard", "gamepad", "wheel"), help="(default: %(default)s)"
     )
+    how.add_argument("--serve", metavar="[HOST:]PORT", help="no window, but a page to drive in (default host: 127.0.0.1)")
     how.add_argument("--config", type=Path, metavar="FILE", help="axes and buttons of gamepad or wheel, see --calibrate")
     how.add_argument("--rate", type=float, metavar="HZ", help="steps per second (default: the environment's own real time)")
     how.add_argument(
@@ -165,6 +168,7 @@ def check_arguments(args: argparse.Namespace) -> None:
     import numpy as np
 
     import sb3_chac.envs  # noqa: F401
+    from sb3_chac.cockpit.browser import parse_address
     from sb3_chac.cockpit.run import drivable_algorithms
 
     if args.algo not in drivable_algorithms():
@@ -181,6 +185,10 @@ def check_arguments(args: argparse.Namespace) -> None:
         raise NotDrivable("--pretrain needs --demos: there is nothing to learn from before the drive.")
     if args.rate is not None and not 0.5 <= args.rate <= 100:
         raise NotDrivable(f"--rate must be from 0.5 to 100 steps per second, got {args.rate:g}.")
+    if args.serve and (args.device != "auto" or args.config):
+        raise NotDrivable("--serve is driven with the browser's devices: leave out --device and --config.")
+    if args.serve:
+        args.serve = parse_address(args.serve)
     if args.device == "keyboard" and args.config:
         raise NotDrivable("--config is for a gamepad or wheel, the keyboard needs none.")
     if args.seed < 0:
@@ -197,23 +205,50 @@ def drive(args: argparse.Namespace) -> None:
     :param args: see ``make_parser``, checked
     """
     from sb3_chac.cockpit.run import DriveRun
-    from sb3_chac.cockpit.window import Window
 
-    window = Window(f"sb3_chac: {args.algo} on {args.env}")
-    drive_run = DriveRun(args, find_device(args))
-    try:
-        drive_run.thread.start()
-        if args.go:
-            drive_run.drive.go_on()
-        wait_for_end(window, drive_run)
-    finally:
-        window.close()
+    if args.serve:
+        drive_run = in_browser(args)
+    else:
+        from sb3_chac.cockpit.window import Window
+
+        window = Window(f"sb3_chac: {args.algo} on {args.env}")
+        drive_run = DriveRun(args, find_device(args))
+        try:
+            begin(drive_run)
+            wait_for_end(window, drive_run)
+        finally:
+            window.close()
     if drive_run.summary is not None:
         print(drive_run.summary)
         print(f"  run folder    {drive_run.run_folder}")
         print(f"Go on with:  sb3-chac drive --resume {shlex.quote(str(drive_run.run_folder))}")
     if drive_run.error is not None:
         raise drive_run.error
+
+
+def begin(drive_run: Any) -> None:
+    """
+    :param drive_run: is begun; unless it is to go at once, it waits for the person
+    """
+    drive_run.thread.start()
+    if drive_run.args.go:
+        drive_run.drive.go_on()
+
+
+def in_browser(args: argparse.Namespace) -> Any:
+    """
+    :param args: see ``make_parser``, checked
+    :return: the run, when it is over
+    """
+    from sb3_chac.cockpit.browser import Browser
+    from sb3_chac.cockpit.run import DriveRun
+    from sb3_chac.cockpit.server import serve
+
+    device = Browser()
+    drive_run = DriveRun(args, device)
+    asyncio.run(serve(drive_run.drive, device, args.serve, lambda: begin(drive_run), lambda: drive_run.is_over))
+    drive_run.thread.join()
+    return drive_run
 
 
 def wait_for_end(window: Any, drive_run: Any) -> None:

@@ -43,7 +43,7 @@ class Person:
 
     def __init__(self, device: Device) -> None:
         self.device = device
-        self._lock = threading.Lock()
+        self.lock = threading.Lock()  # held while the device is used
         self.input = DriverInput(0.0, 0.0, False, True)  # of the present step
         self.sit_in(spaces.Box(-1.0, 1.0, (2,)))
 
@@ -59,7 +59,7 @@ class Person:
         :param event: for the device
         :return: what the person wants to be done
         """
-        with self._lock:
+        with self.lock:
             return self.device.handle(event)
 
     def look(self) -> DriverInput:
@@ -69,19 +69,19 @@ class Person:
 
     def read(self) -> DriverInput:
         """What the person wants now."""
-        with self._lock:
+        with self.lock:
             return self.device.read()
 
     def hand_back(self) -> None:
         """Ends the takeover, if there is one."""
-        with self._lock:
+        with self.lock:
             self.device.hand_back()
 
     def hold(self, device: Device) -> None:
         """
         :param device: to drive with from now on
         """
-        with self._lock:
+        with self.lock:
             self.device = device
 
     @property

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from sb3_chac.cockpit.devices import Command
 from sb3_chac.cockpit.person import Person
 
 TO_BEGIN = "Ready: P begins"
@@ -124,6 +125,23 @@ class Drive:
             self.ended = True
             self._changed.notify_all()
 
+    def obey(self, command: Command | None) -> None:
+        """
+        :param command: of the person; those that concern the display alone are left to it
+        """
+        match command:
+            case Command.PAUSE:
+                self.toggle_pause()
+            case Command.SKIP:
+                self.skip()
+            case Command.QUIT:
+                self.quit()
+
+    @property
+    def notice(self) -> str:
+        """What the person is to be told, "" for nothing."""
+        return "Saving: please wait" if self.ended else self.busy or self.message
+
     # For the driving thread
 
     def wait_for_tick(self) -> None:
@@ -187,6 +205,31 @@ def lost_message(device: str) -> str:
     :param device: its name
     :return: what to tell a person whose device is gone
     """
+    if device == "browser":
+        return "Nobody is at the wheel: open the page, or click into it; then P goes on"
     if device == "keyboard":
         return "The window has lost the keyboard: click into it, then P goes on"
     return f"No {device}: plug it in, or press K for the keyboard; then P goes on"
+
+
+def indicators(display: Display, lag: int) -> list[tuple[str, str]]:
+    """
+    :param lag: gradient steps that the learner owes
+    :return: names and values of what the paper's display shows, and how far the learner lags behind
+    """
+    novice = display.novice
+    minutes, seconds = divmod(int(display.seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return [
+        ("speed", "-" if display.speed is None else f"{3.6 * display.speed:.0f} km/h"),
+        ("takeover", "YOU DRIVE" if display.takeover else "no"),
+        ("total step", f"{display.total_steps}"),
+        ("total time", f"{hours}:{minutes:02}:{seconds:02}"),
+        ("takeover rate", f"{display.takeover_rate:.1%}"),
+        ("stage", novice.stage or "-"),
+        ("self-learning", "-" if novice.self_drives is None else "in use" if novice.self_drives else "no"),
+        ("confidence", "-" if novice.confidence is None else f"{novice.confidence:.2f}"),
+        ("cost", f"{display.cost:g}"),
+        ("episode", f"{display.episode}"),
+        ("updates behind", f"{lag}" if lag else "none"),
+    ]

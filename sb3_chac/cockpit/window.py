@@ -8,7 +8,7 @@ import numpy as np
 import pygame
 
 from sb3_chac.cockpit.devices import Command, Keyboard
-from sb3_chac.cockpit.session import Display, Drive
+from sb3_chac.cockpit.session import Display, Drive, indicators
 from sb3_chac.envs.display import BLACK, EGO, HUMAN, ORANGE, PANEL, RED, TEXT
 
 PICTURE = pygame.Rect(0, 0, 800, 600)
@@ -40,29 +40,6 @@ HELP = (
     ("Q", "quit, with a checkpoint to resume from"),
     ("H", "this help"),
 )
-
-
-def indicators(display: Display, lag: int) -> list[tuple[str, str]]:
-    """
-    :param lag: gradient steps that the learner owes
-    :return: names and values of what the paper's display shows, and how far the learner lags behind
-    """
-    novice = display.novice
-    minutes, seconds = divmod(int(display.seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return [
-        ("speed", "-" if display.speed is None else f"{3.6 * display.speed:.0f} km/h"),
-        ("takeover", "YOU DRIVE" if display.takeover else "no"),
-        ("total step", f"{display.total_steps}"),
-        ("total time", f"{hours}:{minutes:02}:{seconds:02}"),
-        ("takeover rate", f"{display.takeover_rate:.1%}"),
-        ("stage", novice.stage or "-"),
-        ("self-learning", "-" if novice.self_drives is None else "in use" if novice.self_drives else "no"),
-        ("confidence", "-" if novice.confidence is None else f"{novice.confidence:.2f}"),
-        ("cost", f"{display.cost:g}"),
-        ("episode", f"{display.episode}"),
-        ("updates behind", f"{lag}" if lag else "none"),
-    ]
 
 
 class Window:
@@ -119,14 +96,10 @@ class Window:
             command = Command.QUIT
         elif event.type == pygame.KEYDOWN:
             command = COMMANDS.get(event.key, command)
+        self.drive.obey(command)
         match command:
             case Command.PAUSE:
                 self.help = False
-                self.drive.toggle_pause()
-            case Command.SKIP:
-                self.drive.skip()
-            case Command.QUIT:
-                self.drive.quit()
             case Command.HELP:
                 self.help = not self.help
             case Command.KEYBOARD:
@@ -143,9 +116,8 @@ class Window:
             self._draw_picture(display.picture)
         self._draw_side(display, drive.lag)
         self._draw_strip(display)
-        message = "Saving: please wait" if drive.ended else drive.busy or drive.message
-        if message:
-            self._draw_message(message, ORANGE if drive.paused or drive.busy or drive.ended else RED)
+        if drive.notice:
+            self._draw_message(drive.notice, ORANGE if drive.paused or drive.busy or drive.ended else RED)
         if self.help:
             self._draw_help()
         pygame.display.flip()
