@@ -10,6 +10,7 @@ import gymnasium as gym
 import numpy as np
 import pygame
 import pytest
+from cockpit_toys import Car, cockpit, wait_until
 from guided_toys import make_guided
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv
@@ -28,13 +29,11 @@ from sb3_chac.cockpit.devices import (
     save_config,
 )
 from sb3_chac.cockpit.emulator import DeviceEmulator
-from sb3_chac.cockpit.env import Cockpit
 from sb3_chac.cockpit.learner import driven
 from sb3_chac.cockpit.person import NotDrivable, Person, check_drivable
-from sb3_chac.cockpit.recording import FOLDER, Recorder
-from sb3_chac.cockpit.session import Drive, DriveEnded
+from sb3_chac.cockpit.recording import FOLDER
+from sb3_chac.cockpit.session import DriveEnded
 from sb3_chac.cockpit.window import Window
-from sb3_chac.human import InterventionWrapper
 from sb3_chac.human.demonstrations import load_demonstrations
 
 
@@ -43,35 +42,6 @@ class Clock:
 
     def __call__(self):
         return self.now
-
-
-class Car(gym.Env):
-    """A point on a line: the pedals are its acceleration. ``executed`` lists the actions."""
-
-    metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012
-    observation_space = spaces.Box(-1e6, 1e6, (2,), np.float32)
-    action_space = spaces.Box(-1, 1, (2,), np.float32)
-    render_mode = "rgb_array"
-
-    def __init__(self, length=30):
-        self.length, self.executed = length, []
-
-    def reset(self, seed=None, options=None):
-        super().reset(seed=seed)
-        self.speed, self.steps = 3.0, 0
-        return self.obs(), {"speed": self.speed}
-
-    def obs(self):
-        return np.array([self.speed, self.steps], np.float32)
-
-    def step(self, action):
-        self.executed.append(np.array(action))
-        self.speed = max(self.speed + float(action[1]), 0.0)
-        self.steps += 1
-        return self.obs(), 1.0, self.steps == self.length, False, {"speed": self.speed, "cost": 0.5}
-
-    def render(self):
-        return np.zeros((6, 8, 3), np.uint8)
 
 
 def keyboard():
@@ -87,15 +57,6 @@ def wheel(config=WHEEL):
     device = Joystick(config, clock, emulator.open_joystick)
     emulator.plug()
     return device, emulator, answers
-
-
-def cockpit(tmp_path, device, car=None, rate=1000.0):
-    drive = Drive(Person(device), rate)
-    car = car or Car()
-    watched = InterventionWrapper(car, drive.person, drive.person.drives)
-    env = Cockpit(watched, drive, Recorder(tmp_path, car, str(tmp_path / "drive-v0"), "test", 0.1))
-    drive.go_on()
-    return env, drive, car
 
 
 # Devices
@@ -338,13 +299,6 @@ def test_a_skipped_episode_is_truncated(tmp_path):
     drive.skip()  # works in a pause, too
     assert env.step(np.zeros(2, np.float32))[2:4] == (False, True)
     assert drive.paused
-
-
-def wait_until(condition, seconds=10.0):
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "it did not happen"
-        time.sleep(0.002)
 
 
 # Learning beside the drive

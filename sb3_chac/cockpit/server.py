@@ -230,10 +230,10 @@ class Server:
             with suppress(asyncio.TimeoutError):
                 await asyncio.wait_for(self._news.wait(), LOOK)
             display = self.drive.display
-            new_picture = display.picture is not None and display.number != self._picture[0] and bool(self.viewers)
-            if new_picture:
+            is_new = display.number != self._picture[0] and bool(self.viewers)
+            if is_new and display.picture is not None:
                 self._picture = display.number, await asyncio.to_thread(as_jpeg, display.picture)
-            if new_picture or self._news.is_set() or time.monotonic() - told > TELL:
+            if is_new or self._news.is_set() or time.monotonic() - told > TELL:
                 self._news.clear()
                 told = time.monotonic()
                 for viewer in self.viewers:
