@@ -2,6 +2,7 @@
 
     python benchmarks/cockpit.py drive --minutes 10          # C-HAC on SafeDrive-v0, through both stages
     python benchmarks/cockpit.py drive --env MetaDriveSafety-v0
+    python benchmarks/cockpit.py browser --minutes 3         # the same in a Chromium, served on loopback
     python benchmarks/cockpit.py report
     python benchmarks/cockpit.py pictures                    # those of the operator's guide
 
@@ -9,14 +10,18 @@ An emulated person presses and lets go keys at random moments, takes over and ha
 does, with SDL's dummy display. Two CSVs in benchmarks/results/cockpit/ get a row per event and per step of the environment:
 <env>-events.csv, from the event in SDL's queue to the moment at which the environment begins the first step that is driven
 with it; <env>-steps.csv, the moments of the steps, the gradient steps that were owed, what the car waited for, and the
-window's frames. It wants a machine with two cores that does nothing else; the load average is in the rows.
+window's frames. browser.csv gets a row per measured time: "round trip" of a message from the page and back; "shown", from a
+key to the page showing that the driving end has it; and "applied", until the page shows that it was driven.
+It wants a machine with two cores that does nothing else; the load average is in the rows.
 """
 
 import argparse
+import asyncio
 import csv
 import importlib.metadata
 import os
 import random
+import shutil
 import sys
 import tempfile
 import threading
@@ -32,9 +37,11 @@ import pygame
 import torch as th
 
 from sb3_chac import drive as command
-from sb3_chac.cockpit.devices import Keyboard
+from sb3_chac.cockpit.browser import Address, Browser
+from sb3_chac.cockpit.devices import Device, Keyboard
 from sb3_chac.cockpit.emulator import DeviceEmulator
 from sb3_chac.cockpit.run import DriveRun
+from sb3_chac.cockpit.server import Server
 from sb3_chac.cockpit.window import Window
 
 RESULTS = Path(__file__).parent / "results" / "cockpit"
@@ -70,19 +77,20 @@ class Person(threading.Thread):
                     break
 
 
-def make_run(env: str, folder: str, *arguments: str) -> DriveRun:
+def make_run(env: str, folder: str, device: Device, *arguments: str) -> DriveRun:
     """
     :param env: id
     :param folder: for everything that is written
+    :param device: that the person holds
     :param arguments: more of the command line
     """
     os.environ["MINARI_DATASETS_PATH"] = folder
-    own = ["--env", env, "--seed", "1", "--log-folder", folder, "--device", "keyboard", "--go", *arguments]
+    own = ["--env", env, "--seed", "1", "--log-folder", folder, "--go", *arguments]
     args = command.make_parser().parse_args(own)
     command.check_arguments(args)
     sys.argv[1:] = ["drive", *own]
     th.set_num_threads(1)
-    return DriveRun(args, Keyboard())
+    return DriveRun(args, device)
 
 
 def measure(env: str, minutes: float) -> None:
@@ -94,7 +102,7 @@ def measure(env: str, minutes: float) -> None:
     switch = int(60 * minutes / PERIOD * 0.4)
     with tempfile.TemporaryDirectory() as folder:
         window = Window("benchmark")
-        run = make_run(env, folder, "-params", f"switch_after:{switch}")
+        run = make_run(env, folder, Keyboard(), "-params", f"switch_after:{switch}")
         person = Person(seed=0)
 
         def watch() -> None:
@@ -129,6 +137,84 @@ def measure(env: str, minutes: float) -> None:
     write(env, steps, person.events)
 
 
+# In the page: a ping and its answer; and when what is pressed is shown
+PING = """() => new Promise((resolve) => {
+  const begun = performance.now();
+  socket.addEventListener("message", ({ data }) => {
+    if (typeof data === "string" && JSON.parse(data).pong === 0) resolve(performance.now() - begun);
+  });
+  send({ ping: 0 });
+})"""
+WATCH = """() => {
+  window.seen = { shown: [], applied: [] };
+  const begun = {};
+  addEventListener("keydown", () => { begun.shown = begun.applied = performance.now(); }, true);
+  for (const [kind, row] of [["shown", "input"], ["applied", "applied"]]) {
+    new MutationObserver(() => {
+      if (begun[kind]) window.seen[kind].push(performance.now() - begun[kind]);
+      begun[kind] = null;
+    }).observe(byId(row).querySelectorAll(".bar div")[1], { attributes: true });
+  }
+}"""
+
+
+def measure_browser(env: str, minutes: float) -> None:
+    """
+    :param env: id
+    :param minutes: of driving
+    """
+    device = Browser()
+    rows: list[dict[str, Any]] = []
+
+    def drive_in_chromium() -> None:
+        from playwright.sync_api import sync_playwright
+
+        path = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))))
+        with sync_playwright() as playwright:
+            browser = playwright.chromium.launch(executable_path=path, args=["--no-sandbox"])
+            page = browser.new_page(viewport={"width": 1200, "height": 780})
+            page.goto(server.address.url(server.driver_token))
+            page.wait_for_selector("text=You are at the wheel")
+            page.keyboard.press("KeyP")
+            end = time.monotonic() + 60 * minutes
+            rng = random.Random(0)
+            page.evaluate(WATCH)
+            while time.monotonic() < end:
+                rows.extend({"kind": "round trip", "ms": page.evaluate(PING)} for _ in range(5))
+                page.keyboard.down("ArrowUp")  # takes over, too, where an episode has begun
+                time.sleep(rng.uniform(0.3, 0.4))
+                page.keyboard.up("ArrowUp")
+                time.sleep(rng.uniform(0.6, 0.7))  # it is back in the middle
+            rows.extend({"kind": kind, "ms": value} for kind, values in page.evaluate("seen").items() for value in values)
+            facts = {"load": round(os.getloadavg()[1], 2), "cores": os.cpu_count()}
+            versions = {"versions": f"{VERSIONS} chromium={browser.version}"}
+            rows[:] = [row | {"ms": round(row["ms"], 2)} | facts | versions for row in rows]
+            page.keyboard.press("Space")
+            page.keyboard.down("ArrowLeft")
+            time.sleep(0.5)
+            page.screenshot(path=PICTURES / "browser.png")
+            browser.close()
+
+    async def all_of_it() -> None:
+        async with server.listening():
+            run.thread.start()
+            try:
+                await asyncio.to_thread(drive_in_chromium)
+            finally:
+                run.drive.quit()
+            while not run.is_over:
+                await asyncio.sleep(0.1)
+
+    with tempfile.TemporaryDirectory() as folder:
+        run = make_run(env, folder, device)
+        server = Server(run.drive, device, Address("127.0.0.1", 0))
+        asyncio.run(all_of_it())
+        if run.error is not None:
+            raise run.error
+    write_table("browser", rows)
+    report()
+
+
 def write(env: str, steps: list[dict[str, Any]], events: list[float]) -> None:
     """
     :param steps: a row each
@@ -147,17 +233,23 @@ def write(env: str, steps: list[dict[str, Any]], events: list[float]) -> None:
     for step in steps:
         step["time"] = round(step["time"] - first, 5)
         del step["heard"]
-    RESULTS.mkdir(parents=True, exist_ok=True)
-    for kind, table in (("events", rows), ("steps", [step | facts for step in steps])):
-        with (RESULTS / f"{env}-{kind}.csv").open("w", newline="") as file:
-            writer = csv.DictWriter(file, list(table[0]), lineterminator="\n")
-            writer.writeheader()
-            writer.writerows(table)
+    write_table(f"{env}-events", rows)
+    write_table(f"{env}-steps", [step | facts for step in steps])
     report()
+
+
+def write_table(name: str, rows: list[dict[str, Any]]) -> None:
+    RESULTS.mkdir(parents=True, exist_ok=True)
+    with (RESULTS / f"{name}.csv").open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
 
 
 def report() -> None:
     """Prints the figures of the CSVs."""
+    if (RESULTS / "browser.csv").exists():
+        report_browser()
     for file in sorted(RESULTS.glob("*-events.csv")):
         env = file.name.removesuffix("-events.csv")
         events, steps = (list(csv.DictReader((RESULTS / f"{env}-{kind}.csv").open())) for kind in ("events", "steps"))
@@ -167,15 +259,22 @@ def report() -> None:
         intervals, seconds = 1000 * np.diff(times), times[-1]
         tens = np.histogram(times, np.arange(0, seconds, 10))[0] / 10
         print(f"{env}: {seconds / 60:.1f} minutes, {len(steps)} steps, load average {events[0]['load']}")
-        print(
-            f"  input to action [ms]: median {np.median(latency):.0f}, p99 {np.percentile(latency, 99):.1f}, n {len(latency)}"
-        )
+        p50, p99 = np.percentile(latency, (50, 99))
+        print(f"  input to action [ms]: median {p50:.0f}, p99 {p99:.1f}, most {latency.max():.1f}, of {len(latency)} events")
         print(f"  rate [1/s]: {(len(times) - 1) / seconds:.2f}, least in 10 s {tens.min():.1f}")
-        print(
-            f"  interval [ms]: least {intervals.min():.2f}, p99 {np.percentile(intervals, 99):.1f}, most {intervals.max():.0f}"
-        )
+        p99 = np.percentile(intervals, 99)
+        print(f"  between steps [ms]: least {intervals.min():.2f}, p99 {p99:.1f}, most {intervals.max():.0f}")
         print(f"  window: {(frames[-1] - frames[0]) / seconds:.1f} frames per second")
         print(f"  gradient steps owed: median {np.median(lag):.0f}, most {lag.max()}, at the end {lag[-1]}")
+
+
+def report_browser() -> None:
+    rows = list(csv.DictReader((RESULTS / "browser.csv").open()))
+    print(f"Chromium on loopback, load average {rows[0]['load']}")
+    for kind in ("round trip", "shown", "applied"):
+        times = np.array([float(row["ms"]) for row in rows if row["kind"] == kind])
+        p50, p99 = np.percentile(times, (50, 99))
+        print(f"  {kind} [ms]: median {p50:.1f}, p99 {p99:.1f}, most {times.max():.1f}, of {len(times)}")
 
 
 def pictures() -> None:
@@ -184,7 +283,7 @@ def pictures() -> None:
         agent = Path(__file__).parent / "agents" / f"{algo}-SafeDrive-v0.zip"
         with tempfile.TemporaryDirectory() as folder:
             window = Window("picture")
-            run = make_run("SafeDrive-v0", folder, "--algo", algo, "--trained-agent", str(agent))
+            run = make_run("SafeDrive-v0", folder, Keyboard(), "--algo", algo, "--trained-agent", str(agent))
 
             def is_over(run: DriveRun = run, window: Window = window, keys: list[int] = keys, name: str = name) -> bool:
                 display = run.drive.display
@@ -208,11 +307,13 @@ def pictures() -> None:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("command", choices=["drive", "report", "pictures"])
+    parser.add_argument("command", choices=["drive", "browser", "report", "pictures"])
     parser.add_argument("--env", default="SafeDrive-v0", metavar="ID")
     parser.add_argument("--minutes", type=float, default=10.0)
     arguments = parser.parse_args()
     if arguments.command == "drive":
         measure(arguments.env, arguments.minutes)
+    elif arguments.command == "browser":
+        measure_browser(arguments.env, arguments.minutes)
     else:
         {"report": report, "pictures": pictures}[arguments.command]()
