@@ -137,7 +137,8 @@ def run(args: argparse.Namespace, arguments: list[str]) -> None:
         left_behind = finish_recording(args.resume)
         if left_behind is not None:
             print(f"What the drive that was interrupted had recorded:\n{left_behind}\n")
-        arguments = [*command[1:], *without_resume(arguments)]
+        # What follows is recorded as a dataset of its own
+        arguments = [*without("--dataset", command[1:]), *without("--resume", arguments)]
         args = make_parser().parse_args(arguments)
         args.trained_agent = str(checkpoint)
     check_arguments(args)
@@ -146,15 +147,16 @@ def run(args: argparse.Namespace, arguments: list[str]) -> None:
     drive(args)
 
 
-def without_resume(arguments: list[str]) -> list[str]:
+def without(option: str, arguments: list[str]) -> list[str]:
     """
-    :return: the arguments that are not ``--resume RUN_FOLDER``
+    :param option: that has a value
+    :return: the arguments without it
     """
     kept, skip = [], False
     for argument in arguments:
-        if not skip and not argument.startswith("--resume"):
+        if not skip and not argument.startswith(option):
             kept.append(argument)
-        skip = argument == "--resume"
+        skip = argument == option
     return kept
 
 
@@ -170,6 +172,7 @@ def check_arguments(args: argparse.Namespace) -> None:
     import sb3_chac.envs  # noqa: F401
     from sb3_chac.cockpit.browser import parse_address
     from sb3_chac.cockpit.run import drivable_algorithms
+    from sb3_chac.human.dataset_writer import folder_to_make
 
     if args.algo not in drivable_algorithms():
         known = ", ".join(drivable_algorithms())
@@ -198,6 +201,8 @@ def check_arguments(args: argparse.Namespace) -> None:
     if args.dataset is None:
         env = re.sub(r"-v\d+$", "", args.env).replace("/", "-")
         args.dataset = f"drives/{args.algo}-{env}-{time.strftime('%Y%m%d-%H%M%S')}-v0"
+    if folder_to_make(args.dataset, overwrite=True).exists():
+        raise NotDrivable(f"--dataset {args.dataset} exists already, choose another name.")
 
 
 def drive(args: argparse.Namespace) -> None:

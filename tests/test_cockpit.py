@@ -1,6 +1,7 @@
 """A person at the wheel: devices, the drive and what is kept of it. Everything is headless, the devices are emulated."""
 
 import os
+import re
 import threading
 import time
 
@@ -454,20 +455,26 @@ def test_drive_with_keys_then_resume_and_replay(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
     frames = play(monkeypatch, [(5, pygame.K_UP), (12, pygame.K_q)])
-    main_with(monkeypatch, "drive", "--algo", "pvp", "--seed", "1", "--device", "keyboard", "--rate", "50", "--go")
+    command = ["drive", "--algo", "pvp", "--seed", "1", "--device", "keyboard", "--rate", "50", "--go"]
+    main_with(monkeypatch, *command, "--dataset", "drives/first-v0")
     printed = capsys.readouterr().out
     assert "in 1 takeovers" in printed and "--resume logs/pvp/SafeDrive-v0_1" in printed and len(frames) > 0
 
     play(monkeypatch, [(20, pygame.K_q)])
-    main_with(monkeypatch, "drive", "--resume", "logs/pvp/SafeDrive-v0_1", "--dataset", "drives/second-v0")
-    capsys.readouterr()
+    main_with(monkeypatch, "drive", "--resume", "logs/pvp/SafeDrive-v0_1")
+    second = re.search(r"minari/(drives/pvp-SafeDrive-.*-v0)", capsys.readouterr().out)[1]
     model = PVP.load("logs/pvp/SafeDrive-v0_2/SafeDrive-v0.zip")
     assert model.counts["total_steps"] >= 20 and model.counts["human_steps"] >= 5
     model.load_replay_buffer(next(iter((tmp_path / "logs/pvp/SafeDrive-v0_2/checkpoints").glob("*/replay_buffer.pkl"))))
     assert model.replay_buffer.size() == model.counts["total_steps"]
 
-    main_with(monkeypatch, "demos", "replay", "--dataset", "drives/second-v0")
+    main_with(monkeypatch, "demos", "replay", "--dataset", second)
     assert "the returns differ by 0, the observations by 0" in capsys.readouterr().out
+
+    with pytest.raises(SystemExit):
+        main_with(monkeypatch, *command, "--dataset", "drives/first-v0")
+    assert "--dataset drives/first-v0 exists already" in capsys.readouterr().err
+    assert len(list((tmp_path / "logs/pvp").iterdir())) == 2
 
 
 def play(monkeypatch, script):
