@@ -205,6 +205,8 @@ def claims(methods: dict[str, Method]) -> list[str]:
 
 # Pictures
 
+LINES = ["-", "--", ":"]  # one more for every ten methods: as many colours has the cycle
+
 
 def draw_curves(axes: Axes, methods: dict[str, Method], quantity: str, per_step: bool = False) -> None:
     """
@@ -212,7 +214,7 @@ def draw_curves(axes: Axes, methods: dict[str, Method], quantity: str, per_step:
 
     :param per_step: draw it divided by the number of steps
     """
-    for method in methods.values():
+    for number, method in enumerate(methods.values()):
         curves = [curve[quantity] for curve in method.curves if len(curve.get(quantity, ())) > 1]
         if not curves:
             continue
@@ -220,8 +222,9 @@ def draw_curves(axes: Axes, methods: dict[str, Method], quantity: str, per_step:
         values = np.array([np.interp(steps, *curve.T) for curve in curves])
         if per_step:
             values = values / np.maximum(steps, 1)
-        (line,) = axes.plot(steps, values.mean(axis=0), label=method.title, linewidth=1.3)
-        axes.fill_between(steps, values.min(axis=0), values.max(axis=0), color=line.get_color(), alpha=0.12)
+        style = {"color": f"C{number % 10}", "linestyle": LINES[number // 10]}
+        axes.plot(steps, values.mean(axis=0), label=method.title, linewidth=1.3, **style)
+        axes.fill_between(steps, values.min(axis=0), values.max(axis=0), color=style["color"], alpha=0.12)
     axes.set_xlabel("steps of the training")
     axes.grid(alpha=0.25)
 
@@ -232,6 +235,7 @@ def learning(methods: dict[str, Method], results: "Results") -> Figure:
     for axes, (quantity, title) in zip(figure.subplots(1, 3), titles.items(), strict=True):
         draw_curves(axes, {name: method for name, method in methods.items() if not name.startswith("chac-")}, quantity)
         axes.set_title(title)
+        axes.set_xscale("log")  # the person's methods take a tenth of the steps
         if quantity == "safety/safety_cost":
             axes.set_yscale("symlog", linthresh=10)
     handles = {label: line for axes in figure.axes for line, label in zip(*axes.get_legend_handles_labels(), strict=True)}
