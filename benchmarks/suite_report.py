@@ -238,6 +238,7 @@ def learning(methods: dict[str, Method], results: "Results") -> Figure:
         axes.set_xscale("log")  # the person's methods take a tenth of the steps
         if quantity == "safety/safety_cost":
             axes.set_yscale("symlog", linthresh=10)
+            axes.set_ylim(bottom=0)
     handles = {label: line for axes in figure.axes for line, label in zip(*axes.get_legend_handles_labels(), strict=True)}
     figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=7, fontsize="small")
     return figure
