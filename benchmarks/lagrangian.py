@@ -73,9 +73,9 @@ METHODS = {
         dict(**SAC_KWARGS, cost_limit=LIMIT, lagrange_start=5000, pid_kp=0.005, pid_ki=0.001, pid_kd=0.01, pid_tau=0.2),
         False,
     ),
-    "ppo": Method(PPO, 1_000_000, PPO_KWARGS, True),
+    "ppo": Method(PPO, 400_000, PPO_KWARGS, True),
     "ppo_lag": Method(
-        PPOLag, 1_000_000, dict(**PPO_KWARGS, cost_limit=LIMIT, pid_kp=0.005, pid_ki=0.0005, pid_kd=0.01, pid_tau=0.2), True
+        PPOLag, 400_000, dict(**PPO_KWARGS, cost_limit=LIMIT, pid_kp=0.005, pid_ki=0.0005, pid_kd=0.01, pid_tau=0.2), True
     ),
 }
 
