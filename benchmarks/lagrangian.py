@@ -66,10 +66,10 @@ PPO_KWARGS: dict[str, Any] = dict(
     policy_kwargs=dict(log_std_init=-2.0, ortho_init=False, activation_fn=th.nn.ReLU, net_arch=[256, 256]),
 )  # fmt: skip
 METHODS = {
-    "sac": Method(SAC, 60_000, SAC_KWARGS, False),
+    "sac": Method(SAC, 100_000, SAC_KWARGS, False),
     "sac_lag": Method(
         SACLag,
-        60_000,
+        100_000,
         dict(**SAC_KWARGS, cost_limit=LIMIT, lagrange_start=5000, pid_kp=0.05, pid_ki=0.02, pid_kd=0.01, pid_tau=0.2),
         False,
     ),
