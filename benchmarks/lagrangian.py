@@ -197,7 +197,7 @@ def report(args: argparse.Namespace) -> None:
             last = curves[:, -3:].mean(axis=1)
             cells.append(f"{last.mean():.0f}" + (f" ± {last.std(ddof=1):.0f}" if len(last) > 1 else ""))
             if key in ("return", "cost"):
-                axis, share = axes[key == "cost"], np.arange(1, PARTS + 1) / PARTS
+                axis, share = axes[int(key == "cost")], np.arange(1, PARTS + 1) / PARTS
                 (line,) = axis.plot(share, curves.mean(axis=0), label=name.upper().replace("_LAG", "-Lag"))
                 axis.fill_between(share, curves.min(axis=0), curves.max(axis=0), color=line.get_color(), alpha=0.15)
         print(f"| {name} | {len(runs)} | {METHODS[name].steps:,} | " + " | ".join(cells) + " |")
