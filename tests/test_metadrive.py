@@ -192,6 +192,27 @@ def test_a_collision_costs_once_however_long_the_contact(env):
 
 
 @needs_metadrive
+def test_counts_a_collision_with_a_vehicle_that_is_removed_in_that_step(env):
+    """MetaDrive takes away who is off the road, here the only other vehicle."""
+    env.reset(options={"scenario": 3000})
+    traffic = env.simulator.engine.traffic_manager
+    waiting = [name for block in traffic.block_triggered_vehicles for name in block.vehicles]
+    traffic.block_triggered_vehicles = []
+    other = traffic.spawned_objects[waiting[0]]
+    traffic.clear_objects(waiting[1:])
+    traffic._traffic_vehicles.append(other)
+    right_lane = env.simulator.engine.current_map.road_network.graph[env.ego.lane.index[0]][env.ego.lane.index[1]][-1]
+    edge = right_lane.width / 2
+    heading = right_lane.heading_theta_at(10.0)
+    for vehicle, lateral in ((env.ego, edge - 0.9), (other, edge + 0.7)):
+        vehicle.set_position(right_lane.position(10.0, lateral))
+        vehicle.set_heading_theta(heading)
+    info = env.step(np.zeros(2))[4]
+    assert not traffic._traffic_vehicles
+    assert info["contact"] and info["cost"] == 1.0
+
+
+@needs_metadrive
 def test_collision_replaces_the_reward(env):
     place(env, parked_vehicle(env), gap=6.5, speed=5.0)
     for _ in range(60):

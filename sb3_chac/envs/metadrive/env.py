@@ -189,7 +189,8 @@ class MetaDriveSafetyEnv(gym.Env):
         """
         :param vehicles: whether a vehicle touched the ego in this step
         :param objects: whether an object did
-        :return: names of what did: what still does, or else the nearest of its kind
+        :return: names of what did: what still does, or else the nearest of its kind, or else its kind (MetaDrive removes at once
+            a vehicle that is pushed off its lane)
         """
         if not (vehicles or objects):
             return set()
@@ -201,10 +202,10 @@ class MetaDriveSafetyEnv(gym.Env):
         for kind, touched in ((BaseVehicle, vehicles), (TrafficObject, objects)):
             if touched:
                 things = [thing for thing in engine.get_objects().values() if isinstance(thing, kind) and thing is not ego]
-                distances = [np.hypot(*(np.array(thing.position) - ego.position)) for thing in things]
-                near = [thing for thing, distance in zip(things, distances, strict=True) if distance < 15.0]
-                touching = [thing.name for thing in near if self._touches(thing)]
-                names |= set(touching or [things[int(np.argmin(distances))].name])
+                distances = {thing.name: float(np.hypot(*(np.array(thing.position) - ego.position))) for thing in things}
+                near = {thing.name for thing in things if distances[thing.name] < 15.0}
+                touching = {thing.name for thing in things if thing.name in near and self._touches(thing)}
+                names |= touching or {min(near, key=distances.__getitem__, default=kind.__name__)}
         return names
 
     def _touches(self, thing: Any) -> bool:
