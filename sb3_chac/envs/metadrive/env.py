@@ -189,8 +189,8 @@ class MetaDriveSafetyEnv(gym.Env):
         """
         :param vehicles: whether a vehicle touched the ego in this step
         :param objects: whether an object did
-        :return: names of what did: what still does, or else the nearest of its kind, or else its kind (MetaDrive removes at once
-            a vehicle that is pushed off its lane)
+        :return: names of what did: what still does, or else the nearest of its kind, or else its kind (MetaDrive removes a
+            vehicle in the step that pushes it off its lane)
         """
         if not (vehicles or objects):
             return set()
