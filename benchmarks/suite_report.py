@@ -218,7 +218,8 @@ def draw_curves(axes: Axes, methods: dict[str, Method], quantity: str, per_step:
         curves = [curve[quantity] for curve in method.curves if len(curve.get(quantity, ())) > 1]
         if not curves:
             continue
-        steps = np.linspace(max(c[0, 0] for c in curves), min(c[-1, 0] for c in curves), 60)
+        first, last = max(c[0, 0] for c in curves), min(c[-1, 0] for c in curves)
+        steps = np.unique(np.concatenate([c[:, 0] for c in curves]).clip(first, last))
         values = np.array([np.interp(steps, *curve.T) for curve in curves])
         if per_step:
             values = values / np.maximum(steps, 1)
@@ -251,7 +252,7 @@ def takeovers(methods: dict[str, Method], results: "Results") -> Figure | None:
     figure = Figure(figsize=(6, 4), layout="constrained")
     axes = figure.subplots()
     draw_curves(axes, guided, "takeover/human_steps", per_step=True)
-    axes.set(title="takeover rate: the human's share of the steps so far", ylim=(0, None))
+    axes.set(title="takeover rate: the human's share of the steps so far", ylim=(0, None), xscale="log")
     axes.legend(fontsize="small")
     return figure
 
