@@ -179,10 +179,8 @@ def interval(scores: np.ndarray) -> tuple[float, float]:
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FutureWarning)  # rliable's use of arch
-        random = np.random.RandomState(0)
-        _, intervals = get_interval_estimates(
-            {"": scores}, lambda x: np.array([x.mean()]), reps=RESAMPLES, random_state=random
-        )
+        np.random.seed(0)  # rliable draws from numpy's global generator, whatever random_state it is given
+        _, intervals = get_interval_estimates({"": scores}, lambda x: np.array([x.mean()]), reps=RESAMPLES)
     low, high = intervals[""][:, 0]
     return float(low), float(high)
 

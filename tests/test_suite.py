@@ -19,6 +19,8 @@ import suite_job  # noqa: E402
 import suite_report  # noqa: E402
 from suite_job import Job, Outcome  # noqa: E402
 
+from sb3_chac.common.checkpoints import newest_checkpoint  # noqa: E402
+
 ROWS = {row.name: row for row in suite.ROWS}
 
 
@@ -131,6 +133,13 @@ def test_the_report_has_all_methods_and_names_what_contradicts_the_paper(tmp_pat
         assert (tmp_path / f"{name}.png").stat().st_size > 5000
 
 
+def test_the_same_scores_give_the_same_interval():
+    scores = np.random.default_rng(0).normal(size=(3, 50))
+    low, high = suite_report.interval(scores)
+    assert low < scores.mean() < high
+    assert suite_report.interval(scores) == (low, high)
+
+
 def test_thinned_curves_keep_the_last_point():
     curve = np.column_stack([np.arange(1000), np.arange(1000), np.zeros(1000)])
     thin = suite_job.thinned(curve)
@@ -143,7 +152,7 @@ def test_a_killed_suite_goes_on_from_checkpoints_and_takes_its_processes_along(t
     first = subprocess.Popen(arguments, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     logs = tmp_path / "work" / "pvp-0" / "logs" / "pvp"
     deadline = time.monotonic() + 120
-    while not list(logs.glob("*/checkpoints/[0-9]*")):
+    while not any(newest_checkpoint(folder) for folder in logs.glob("*/checkpoints")):  # a complete one
         assert first.poll() is None
         assert time.monotonic() < deadline
         time.sleep(0.2)

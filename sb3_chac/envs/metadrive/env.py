@@ -189,8 +189,8 @@ class MetaDriveSafetyEnv(gym.Env):
         """
         :param vehicles: whether a vehicle touched the ego in this step
         :param objects: whether an object did
-        :return: names of what did: what still does, or else the nearest of its kind, or else its kind (MetaDrive removes a
-            vehicle in the step that pushes it off its lane)
+        :return: names of what did: what still does, or else the nearest of its kind within 15 m, or else its kind (MetaDrive
+            removes a vehicle in the step that pushes it off its lane)
         """
         if not (vehicles or objects):
             return set()
@@ -201,10 +201,14 @@ class MetaDriveSafetyEnv(gym.Env):
         names = set()
         for kind, touched in ((BaseVehicle, vehicles), (TrafficObject, objects)):
             if touched:
-                things = [thing for thing in engine.get_objects().values() if isinstance(thing, kind) and thing is not ego]
-                distances = {thing.name: float(np.hypot(*(np.array(thing.position) - ego.position))) for thing in things}
-                near = {thing.name for thing in things if distances[thing.name] < 15.0}
-                touching = {thing.name for thing in things if thing.name in near and self._touches(thing)}
+                things = {
+                    thing.name: thing
+                    for thing in engine.get_objects().values()
+                    if isinstance(thing, kind) and thing is not ego
+                }
+                distances = {name: np.hypot(*(np.array(thing.position) - ego.position)) for name, thing in things.items()}
+                near = [name for name, distance in distances.items() if distance < 15.0]
+                touching = {name for name in near if self._touches(things[name])}
                 names |= touching or {min(near, key=distances.__getitem__, default=kind.__name__)}
         return names
 
