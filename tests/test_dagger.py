@@ -11,9 +11,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from takeover_toys import EXPERT, DictIntegrator, constant
 
 from sb3_chac import IWR, HGDagger, InterventionWrapper
-from sb3_chac.common.buffers import TransitionStore
 from sb3_chac.human.demonstrations import DatasetError, Demonstrations
-from sb3_chac.iwr.iwr import intervention_weights, row_numbers
+from sb3_chac.iwr.iwr import class_weights
 
 each_algorithm = pytest.mark.parametrize("algorithm", [HGDagger, IWR])
 
@@ -58,20 +57,12 @@ def demonstrations(n=50):
     )
 
 
-def test_intervention_weights():
-    weights = intervention_weights(np.array([True, False, False, True, False, False, False, False]))
+def test_class_weights():
+    weights = class_weights(np.array([True, False, False, True, False, False, False, False]))
     np.testing.assert_allclose(weights, [1 / 4, 1 / 12, 1 / 12, 1 / 4, 1 / 12, 1 / 12, 1 / 12, 1 / 12], rtol=1e-12)
-    for is_intervention in (True, False):
-        np.testing.assert_allclose(intervention_weights(np.full(4, is_intervention)), [0.25] * 4)
-    assert len(intervention_weights(np.zeros(0, bool))) == 0
-
-
-def test_row_numbers_in_a_ring():
-    store = TransitionStore(5, {"x": ((1,), np.float32)})
-    assert len(row_numbers(store)) == 0
-    for i in range(12):
-        store.append({"x": i})
-        np.testing.assert_array_equal(row_numbers(store), store.arrays["x"][: len(store), 0])
+    for is_human in (True, False):
+        np.testing.assert_allclose(class_weights(np.full(4, is_human)), [0.25] * 4)
+    assert len(class_weights(np.zeros(0, bool))) == 0
 
 
 @each_algorithm
@@ -106,8 +97,8 @@ def test_what_is_learned_from():
             assert weights is None
             continue
         np.testing.assert_array_equal(actions[14:], model.replay_buffer.novice.arrays["action"][:16])
-        # Eight interventions have half of the weight, the demonstrations and the novice the other half
-        np.testing.assert_allclose(weights, [0.5 / 22] * 6 + [0.5 / 8] * 8 + [0.5 / 22] * 16)
+        # The human has half of the weight, the novice the other half
+        np.testing.assert_allclose(weights, [0.5 / 14] * 14 + [0.5 / 16] * 16)
 
 
 @each_algorithm
