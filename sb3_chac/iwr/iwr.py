@@ -17,7 +17,7 @@ class IWR(HGDagger):
 
     What the human drove is one class, what the novice drove in the rounds the other; batches are drawn so that both are
     equally likely, see ``class_weights``. In the paper the demonstrations of the warm-up belong to the novice's class. Here
-    they are the human's, as in HACO's baselines (https://github.com/decisionforce/HACO): success then grows over the rounds.
+    they are the human's: on SafeDrive success then does not dip after the first round (benchmarks/NOTES.md).
 
     For the parameters see ``HGDagger``.
     """
