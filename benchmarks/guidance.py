@@ -45,7 +45,7 @@ RESULTS = {
     "MetaDriveSafety-v0": HERE / "results" / "guidance-metadrive",
 }
 SIMULATORS = {"SafeDrive-v0": "highway-env", "MetaDriveSafety-v0": "metadrive-simulator"}
-TEST_MAPS, TUNING_MAPS = range(1000, 1050), range(2000, 2050)
+TEST_MAPS, TUNING_MAPS = range(1000, 1200), range(2000, 2200)
 FIRST_TUNING_SEED = 100
 SWITCH = 50_000
 

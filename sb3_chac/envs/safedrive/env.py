@@ -10,6 +10,7 @@ from highway_env.road.road import Road
 
 from sb3_chac.common.checks import check_integer, check_range
 from sb3_chac.envs.display import STEPS_PER_SECOND
+from sb3_chac.envs.driving.corridors import N_CORRIDORS, ROUTE_SPACING, Corridors
 from sb3_chac.envs.safedrive.driver import IMPERFECTIONS, ScriptedDriver
 from sb3_chac.envs.safedrive.geometry import SPACING, Pose, boxes_overlap, wrap_angle
 from sb3_chac.envs.safedrive.lidar import Lidar
@@ -21,6 +22,7 @@ SUBSTEPS = 2
 ARRIVES_BEFORE_END = 5.0  # [m]
 CHECKPOINTS = np.array([8.0, 16.0, 26.0, 38.0, 50.0])  # [m] ahead on the route
 N_EGO, N_NAVIGATION = 9, 2 * len(CHECKPOINTS)
+ROUTE = np.arange(0.0, CHECKPOINTS[-1] + ROUTE_SPACING / 2, ROUTE_SPACING)  # [m] where the route is rebuilt from them
 CONTACT_MEMORY = 10  # steps without contact after which touching the same object is a new collision
 PARKED_TOWED_AFTER = 50  # steps after a collision with a parked vehicle
 SCENES_KEPT = 64
@@ -90,6 +92,7 @@ class SafeDriveEnv(gym.Env):
     :param collision_penalty: R_collision, subtracted per collision
     :param arrival_reward: R_term at the destination
     :param out_of_road_penalty: R_term off the road, subtracted
+    :param corridors: whether the observation ends with the corridors
     :param render_mode: "rgb_array", "human" or None
     :param show_lidar: whether pictures show the lidar's rays
     :raises ValueError: for an argument out of its range
@@ -110,6 +113,7 @@ class SafeDriveEnv(gym.Env):
         collision_penalty: float = 5.0,
         arrival_reward: float = 10.0,
         out_of_road_penalty: float = 5.0,
+        corridors: bool = True,
         render_mode: str | None = None,
         show_lidar: bool = False,
     ) -> None:
@@ -147,7 +151,9 @@ class SafeDriveEnv(gym.Env):
 
         self.action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
         self.lidar = Lidar()
-        self.observation_space = spaces.Box(-1.0, 1.0, (N_EGO + N_NAVIGATION + self.lidar.rays,), np.float32)
+        self._corridors = Corridors(self.lidar.rays, self.lidar.reach) if corridors else None
+        n_observation = N_EGO + N_NAVIGATION + self.lidar.rays + N_CORRIDORS * corridors
+        self.observation_space = spaces.Box(-1.0, 1.0, (n_observation,), np.float32)
         self._scenes: OrderedDict[int, Scene] = OrderedDict()
         self._viewer: Any = None
 
@@ -305,7 +311,11 @@ class SafeDriveEnv(gym.Env):
         observation[N_EGO : N_EGO + N_NAVIGATION : 2] = np.tanh(bearing / 0.4)
         observation[N_EGO + 1 : N_EGO + N_NAVIGATION : 2] = np.tanh(wrap_angle(points[:, 2] - ego.heading) / 0.6)
         observation[N_EGO + N_NAVIGATION :] = 1 - distances / self.lidar.reach
-        return np.clip(observation, -1.0, 1.0)
+        observation = np.clip(observation, -1.0, 1.0)
+        if self._corridors is None:
+            return observation
+        lidar = observation[N_EGO + N_NAVIGATION :]
+        return np.concatenate([observation, self._corridors(lidar, *route_ahead(observation))], dtype=np.float32)
 
     def scan(self) -> tuple[np.ndarray, np.ndarray]:
         """
@@ -389,3 +399,23 @@ class SafeDriveEnv(gym.Env):
         return self._road[1]
 
     _road: tuple[Map, Road] | None = None
+
+
+def route_ahead(observation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """
+    Rebuild the middle of the route from an observation: its direction at the ego and at the checkpoints, integrated.
+
+    :param observation: shape (259,) or longer
+    :return: [m] points every metre from beside the ego to 50 m ahead, in the ego's frame, shape (51, 2), and [rad] the
+        route's headings there, shape (51,)
+    """
+    here = -0.15 * np.arctanh(np.clip(observation[2], -0.999999, 0.999999))
+    ahead = 0.6 * np.arctanh(np.clip(observation[N_EGO + 1 : N_EGO + N_NAVIGATION : 2], -0.999999, 0.999999))
+    headings = np.interp(ROUTE, np.concatenate([[0.0], CHECKPOINTS]), np.concatenate([[here], ahead]))
+    directions = np.stack([np.cos(headings), np.sin(headings)], axis=1)
+    lateral = observation[0] * HALF_WIDTH
+    route = np.empty((len(ROUTE), 2))
+    route[0] = directions[0, 1] * lateral, -directions[0, 0] * lateral
+    np.cumsum((directions[1:] + directions[:-1]) * (ROUTE_SPACING / 2), axis=0, out=route[1:])
+    route[1:] += route[0]
+    return route, headings

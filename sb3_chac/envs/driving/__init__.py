@@ -1,0 +1,1 @@
+"""Parts that both driving tasks share."""
