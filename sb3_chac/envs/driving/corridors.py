@@ -23,11 +23,12 @@ class Corridors:
 
     :param rays: number of lidar rays, in equal steps around the vehicle, ray 0 straight ahead
     :param reach: [m] of the rays
+    :param laterals: [m] offsets of the strips' middles from that of the route, shape (9,)
     """
 
-    def __init__(self, rays: int, reach: float) -> None:
+    def __init__(self, rays: int, reach: float, laterals: np.ndarray = LATERALS) -> None:
         angles = np.arange(rays) * 2 * np.pi / rays
-        self.reach = reach
+        self.reach, self.laterals = reach, laterals
         self.ahead = np.flatnonzero(np.cos(angles) > 1e-9)
         self.cos, self.sin = np.cos(angles[self.ahead]), np.sin(angles[self.ahead])
         # A point is |k| (x^2 + y^2) / 2 - sign(k) y from an arc of curvature k, up to terms of second order, which are
@@ -71,8 +72,7 @@ class Corridors:
         bend = np.maximum(self.bend[:, 0], 1e-9)
         return np.where(nearest > -np.inf, np.arctan2(bend, nearest) / bend, FAR)
 
-    @staticmethod
-    def _strips(x: np.ndarray, y: np.ndarray, route: np.ndarray, headings: np.ndarray) -> np.ndarray:
+    def _strips(self, x: np.ndarray, y: np.ndarray, route: np.ndarray, headings: np.ndarray) -> np.ndarray:
         """
         Project the hits on the nearest points of the route.
 
@@ -83,5 +83,21 @@ class Corridors:
         dx, dy = x - route[nearest, 0], y - route[nearest, 1]
         along = nearest * ROUTE_SPACING + dx * cos + dy * sin
         along = np.where(along > STRIPS_BEGIN, along, FAR)
-        inside = np.abs(dy * cos - dx * sin - LATERALS[:, None]) < STRIP_HALF_WIDTHS[:, None, None]
+        inside = np.abs(dy * cos - dx * sin - self.laterals[:, None]) < STRIP_HALF_WIDTHS[:, None, None]
         return np.where(inside, along, FAR).min(axis=2)
+
+
+def route_along(start: tuple[float, float], headings: np.ndarray) -> np.ndarray:
+    """
+    Integrate the headings of a route.
+
+    :param start: [m] its first point
+    :param headings: [rad] at its points, which are ``ROUTE_SPACING`` apart, shape (n,)
+    :return: [m] its points, shape (n, 2)
+    """
+    directions = np.stack([np.cos(headings), np.sin(headings)], axis=1)
+    route = np.empty((len(headings), 2))
+    route[0] = start
+    np.cumsum((directions[1:] + directions[:-1]) * (ROUTE_SPACING / 2), axis=0, out=route[1:])
+    route[1:] += route[0]
+    return route

@@ -10,7 +10,7 @@ from highway_env.road.road import Road
 
 from sb3_chac.common.checks import check_integer, check_range
 from sb3_chac.envs.display import STEPS_PER_SECOND
-from sb3_chac.envs.driving.corridors import N_CORRIDORS, ROUTE_SPACING, Corridors
+from sb3_chac.envs.driving.corridors import N_CORRIDORS, ROUTE_SPACING, Corridors, route_along
 from sb3_chac.envs.safedrive.driver import IMPERFECTIONS, ScriptedDriver
 from sb3_chac.envs.safedrive.geometry import SPACING, Pose, boxes_overlap, wrap_angle
 from sb3_chac.envs.safedrive.lidar import Lidar
@@ -412,10 +412,5 @@ def route_ahead(observation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     here = -0.15 * np.arctanh(np.clip(observation[2], -0.999999, 0.999999))
     ahead = 0.6 * np.arctanh(np.clip(observation[N_EGO + 1 : N_EGO + N_NAVIGATION : 2], -0.999999, 0.999999))
     headings = np.interp(ROUTE, np.concatenate([[0.0], CHECKPOINTS]), np.concatenate([[here], ahead]))
-    directions = np.stack([np.cos(headings), np.sin(headings)], axis=1)
     lateral = observation[0] * HALF_WIDTH
-    route = np.empty((len(ROUTE), 2))
-    route[0] = directions[0, 1] * lateral, -directions[0, 0] * lateral
-    np.cumsum((directions[1:] + directions[:-1]) * (ROUTE_SPACING / 2), axis=0, out=route[1:])
-    route[1:] += route[0]
-    return route, headings
+    return route_along((np.sin(here) * lateral, -np.cos(here) * lateral), headings), headings
