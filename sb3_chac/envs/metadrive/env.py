@@ -93,7 +93,9 @@ class MetaDriveSafetyEnv(gym.Env):
     **Cost** (``info["cost"]``): 1 per collision, counted when a contact begins. ``info["contact_cost"]`` is MetaDrive's own: 1
     on each step in contact with something, and for leaving the road.
 
-    **Ends** (terminated): at the destination, off the road or off the route. Truncated after ``horizon`` steps.
+    **Ends** (terminated): at the destination, off the road or off the route. Truncated after ``horizon`` steps, and when a
+    contact has lasted for ``contact_limit`` steps: the ego cannot reverse and others do not make way, so that it may press
+    against a vehicle to the horizon, at -5 a step. Neither MetaDrive nor the published protocols end that (None).
 
     **Info**: as SafeDrive's (``cost``, ``collision``, ``contact``, ``out_of_road``, ``arrive_dest``, ``is_success``,
     ``route_completion``, ``speed`` [m/s], ``episode_cost``, ``scenario``), and ``contact_cost``.
@@ -110,6 +112,8 @@ class MetaDriveSafetyEnv(gym.Env):
     :param traffic_density: vehicles per 10 m of lane
     :param max_speed: [km/h] of the ego
     :param horizon: [steps of 0.1 s] after which an episode is truncated
+    :param contact_limit: [steps of 0.1 s] that a contact may last until the episode is truncated, None for ever; shorter
+        breaks than 10 steps do not interrupt it
     :param raw_observations: give MetaDrive's own 259 numbers as they are, without corridors
     :param corridors: whether the observation ends with the corridors
     :param headless: go without MetaDrive's assets, None to let the environment variable SB3_CHAC_METADRIVE_HEADLESS decide
@@ -130,6 +134,7 @@ class MetaDriveSafetyEnv(gym.Env):
         traffic_density: float | None = None,
         max_speed: float | None = None,
         horizon: int | None = None,
+        contact_limit: int | None = 100,
         raw_observations: bool = False,
         corridors: bool = True,
         headless: bool | None = None,
@@ -147,12 +152,14 @@ class MetaDriveSafetyEnv(gym.Env):
         check_range("traffic_density", settings.traffic_density, low=0.0, high=1.0)
         check_range("max_speed", settings.max_speed, low=1.0, high=200.0)
         check_integer("horizon", settings.horizon, low=1)
+        if contact_limit is not None:
+            check_integer("contact_limit", contact_limit, low=1)
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise ValueError(f"render_mode must be None or one of {self.metadata['render_modes']}, got {render_mode!r}.")
         check_installed()
         prepare(is_headless(headless))
         self.start_scenario, self.num_scenarios = int(start_scenario), int(settings.num_scenarios)
-        self.horizon = int(settings.horizon)
+        self.horizon, self.contact_limit = int(settings.horizon), contact_limit
         self.render_mode = render_mode
         self.hud: dict[str, Any] = {}  # what wrappers want to have shown beside the speed
         self.action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
@@ -193,6 +200,7 @@ class MetaDriveSafetyEnv(gym.Env):
         observation, info = self.simulator.reset(seed=self.scenario)
         self.steps, self.episode_cost, self.collisions = 0, 0, 0
         self._touched: dict[Any, int] = {}  # object -> step of the last contact
+        self._contact_began: int | None = None  # the step, of a contact that lasts
         info = self._info(info)
         if self.render_mode == "human":
             self.render()
@@ -204,10 +212,11 @@ class MetaDriveSafetyEnv(gym.Env):
         observation, reward, terminated, truncated, info = self.simulator.step([steering, throttle])
         self.steps += 1
         self._count_collisions(info)
+        truncated = bool(truncated) or (not terminated and self._contact_lasts_too_long())
         info = self._info(info)
         if self.render_mode == "human":
             self.render()
-        return self._observed(observation), float(reward), bool(terminated), bool(truncated), info
+        return self._observed(observation), float(reward), bool(terminated), truncated, info
 
     def _count_collisions(self, info: dict[str, Any]) -> None:
         """
@@ -220,6 +229,15 @@ class MetaDriveSafetyEnv(gym.Env):
             self.collisions += self.steps - self._touched.get(name, -CONTACT_MEMORY) >= CONTACT_MEMORY
             self._touched[name] = self.steps
         self.episode_cost += self.collisions
+
+    def _contact_lasts_too_long(self) -> bool:
+        last = max(self._touched.values(), default=-CONTACT_MEMORY)
+        if self.steps - last >= CONTACT_MEMORY:
+            self._contact_began = None
+        elif self._contact_began is None:
+            self._contact_began = self.steps
+        limit, began = self.contact_limit, self._contact_began
+        return limit is not None and began is not None and last - began + 1 >= limit
 
     def _touching(self, vehicles: bool, objects: bool) -> set[str]:
         """
