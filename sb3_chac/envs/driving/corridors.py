@@ -1,6 +1,7 @@
 """Corridors: how far the ways ahead are free, computed from a lidar scan and a route that are in the observation already."""
 
 import numpy as np
+from gymnasium import spaces
 
 FAR = 40.0  # [m] farther hits count as none
 # Circular arcs from the ego's position, tangent to its heading
@@ -85,3 +86,21 @@ class Corridors:
         along = np.where(along > STRIPS_BEGIN, along, FAR)
         inside = np.abs(dy * cos - dx * sin - LATERALS[:, None]) < STRIP_HALF_WIDTHS[:, None, None]
         return np.where(inside, along, FAR).min(axis=2)
+
+
+def corridors_remedy(trained_on: spaces.Space | None, given: spaces.Space | None) -> str:
+    """
+    Say what to do if two observation spaces differ by the corridors alone.
+
+    :param trained_on: of a model or a dataset
+    :param given: of the environment
+    :return: a sentence, with a blank before it; empty if something else is the matter
+    """
+    sizes = [space.shape[0] if isinstance(space, spaces.Box) and len(space.shape) == 1 else 0 for space in (trained_on, given)]
+    if abs(sizes[0] - sizes[1]) != N_CORRIDORS:
+        return ""
+    flag = sizes[0] > sizes[1]
+    return (
+        f" The {sizes[0]} numbers are {'with' if flag else 'without'} corridors, the {sizes[1]} {'without' if flag else 'with'} "
+        f"them: make the environment with corridors={flag} (on the command line: --env-kwargs corridors:{flag})."
+    )
