@@ -14,6 +14,7 @@ import copy
 import csv
 import importlib.metadata
 from collections import OrderedDict
+from itertools import pairwise
 from pathlib import Path
 
 import gymnasium as gym
@@ -114,13 +115,14 @@ def report(args: argparse.Namespace) -> None:
     print("| P(Q_r > Q_g) | states | pi_r did better | mean gain |")
     print("|---|---|---|---|")
     figure, axis = plt.subplots(figsize=(4.5, 4.2))
-    for low, high in zip(BINS[:-1], BINS[1:], strict=True):
+    for low, high in pairwise(BINS):
         inside = (confidence >= low) & ((confidence < high) | (high == 1.0))
         n, better = int(inside.sum()), int((gain[inside] > 0).sum())
         if n == 0:
             continue
         bounds = wilson(better, n)
-        print(f"| {low:.1f} to {high:.1f} | {n} | {better / n:.2f} ({bounds[0]:.2f} to {bounds[1]:.2f}) | {gain[inside].mean():.2f} |")
+        interval = f"{better / n:.2f} ({bounds[0]:.2f} to {bounds[1]:.2f})"
+        print(f"| {low:.1f} to {high:.1f} | {n} | {interval} | {gain[inside].mean():.2f} |")
         middle = confidence[inside].mean()
         axis.plot([middle, middle], bounds, color="tab:blue", linewidth=1)
         axis.plot(middle, better / n, "o", color="tab:blue", markersize=3 + n**0.5 / 4)

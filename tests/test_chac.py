@@ -537,7 +537,7 @@ def test_presets_fill_in_what_the_docstring_says(algorithm, preset):
 @pytest.mark.parametrize("preset", ["default", "paper"])
 @pytest.mark.parametrize("name", [*CHAC.presets["default"], "target_entropy"])
 def test_arguments_win_over_the_preset(name, preset):
-    booleans = dict.fromkeys(("bounded_targets", "normalize_rewards"), [False, True])
+    booleans = {key: [False, True] for key in ("bounded_targets", "normalize_rewards")}
     others = {"bootstrap": ["self", "executed"], "prefit_steps": [9, 10]} | booleans
     for value in others.get(name, [0.05, 0.06]):
         kwargs = {name: value}

@@ -207,9 +207,7 @@ class DualReplayBuffer(ReplayBuffer):
     def _append_return(self, pending: deque[dict[str, Any]]) -> None:
         """Completes the oldest transition: rewards up to the last one, then its next observation."""
         ends = {name: value for name, value in pending[-1].items() if name == "done" or name.startswith("next_observation/")}
-        sums = {
-            name: sum(self.gamma**k * row[name] for k, row in enumerate(pending)) for name in ("reward", "cost")
-        }
+        sums = {name: sum(self.gamma**k * row[name] for k, row in enumerate(pending)) for name in ("reward", "cost")}
         self._append(pending.popleft() | ends | sums | {"discount": self.gamma ** (len(pending) + 1)})
 
     def _flush(self, pending: deque[dict[str, Any]]) -> None:

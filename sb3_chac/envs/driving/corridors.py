@@ -4,14 +4,16 @@ import numpy as np
 from gymnasium import spaces
 
 FAR = 40.0  # [m] farther hits count as none
-# Circular arcs from the ego's position, tangent to its heading
-CURVATURES = np.array([-0.2, -0.14, -0.09, -0.06, -0.04, -0.025, -0.012, 0, 0.012, 0.025, 0.04, 0.06, 0.09, 0.14, 0.2])  # [1/m]
+# [1/m] of circular arcs from the ego's position, tangent to its heading
+CURVATURES = np.array([-0.2, -0.14, -0.09, -0.06, -0.04, -0.025, -0.012, 0, 0.012, 0.025, 0.04, 0.06, 0.09, 0.14, 0.2])
 ARC_HALF_WIDTHS = np.array([1.2, 1.9])  # [m]
 # Strips along the route
 LATERALS = np.linspace(-3.0, 3.0, 9)  # [m] offsets of their middles from that of the route
 STRIP_HALF_WIDTHS = np.array([0.6, 1.2])  # [m]
 N_ARCS, N_STRIPS = len(ARC_HALF_WIDTHS) * len(CURVATURES), len(STRIP_HALF_WIDTHS) * len(LATERALS)
 N_CORRIDORS = N_ARCS + N_STRIPS
+N_VIEW = 2 * N_CORRIDORS  # what an observation holds of them
+FASTEST = 1.5  # [m] change of a free distance within a step that is told from greater ones
 STRIPS_BEGIN = 0.5  # [m] along the route, nearer hits are beside the ego
 ROUTE_SPACING = 1.0  # [m] between the points of a route
 
@@ -88,6 +90,36 @@ class Corridors:
         return np.where(inside, along, FAR).min(axis=2)
 
 
+class CorridorView:
+    """
+    Corridors, and how their free distances changed since the observation before: what stands comes nearer as fast as the ego
+    drives, what drives along does not. Without the change a policy takes a lane for blocked in which all go on at its speed,
+    stays in the other one, and runs into what stands there.
+
+    :param rays: see ``Corridors``
+    :param reach: [m], alike
+    """
+
+    def __init__(self, rays: int, reach: float) -> None:
+        self.corridors = Corridors(rays, reach)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the observation before."""
+        self.last: np.ndarray | None = None
+
+    def __call__(self, closeness: np.ndarray, route: np.ndarray, headings: np.ndarray) -> np.ndarray:
+        """
+        Look at the next observation. The parameters are those of ``Corridors``.
+
+        :return: all corridors, then the change of each free distance in units of ``FASTEST``, within [-1, 1], negative where
+            something comes nearer, 0 in a first observation; shape (N_VIEW,)
+        """
+        here = self.corridors(closeness, route, headings)
+        last, self.last = here if self.last is None else self.last, here
+        return np.concatenate([here, np.clip((last - here) * (FAR / FASTEST), -1.0, 1.0)])
+
+
 def corridors_remedy(trained_on: spaces.Space | None, given: spaces.Space | None) -> str:
     """
     Say what to do if two observation spaces differ by the corridors alone.
@@ -97,10 +129,10 @@ def corridors_remedy(trained_on: spaces.Space | None, given: spaces.Space | None
     :return: a sentence, with a blank before it; empty if something else is the matter
     """
     sizes = [space.shape[0] if isinstance(space, spaces.Box) and len(space.shape) == 1 else 0 for space in (trained_on, given)]
-    if abs(sizes[0] - sizes[1]) != N_CORRIDORS:
+    if abs(sizes[0] - sizes[1]) != N_VIEW:
         return ""
     flag = sizes[0] > sizes[1]
     return (
-        f" The {sizes[0]} numbers are {'with' if flag else 'without'} corridors, the {sizes[1]} {'without' if flag else 'with'} "
-        f"them: make the environment with corridors={flag} (on the command line: --env-kwargs corridors:{flag})."
+        f" {max(sizes)} numbers are with corridors, {min(sizes)} without: make the environment with corridors={flag} (on the "
+        f"command line: --env-kwargs corridors:{flag})."
     )

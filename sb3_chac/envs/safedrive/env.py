@@ -10,7 +10,7 @@ from highway_env.road.road import Road
 
 from sb3_chac.common.checks import check_integer, check_range
 from sb3_chac.envs.display import STEPS_PER_SECOND
-from sb3_chac.envs.driving.corridors import N_CORRIDORS, ROUTE_SPACING, Corridors
+from sb3_chac.envs.driving.corridors import N_VIEW, ROUTE_SPACING, CorridorView
 from sb3_chac.envs.safedrive.driver import IMPERFECTIONS, ScriptedDriver
 from sb3_chac.envs.safedrive.geometry import SPACING, Pose, boxes_overlap, wrap_angle
 from sb3_chac.envs.safedrive.lidar import Lidar
@@ -47,7 +47,7 @@ class SafeDriveEnv(gym.Env):
     **Actions**, shape (2,), in [-1, 1]: steering (1 is 0.6 rad of the front wheels to the right) and acceleration (1 is
     4 m/s2, -1 brakes as much; the vehicle does not drive backwards; top speed 15 m/s).
 
-    **Observations**, shape (307,), in [-1, 1]; t(x) stands for tanh(x):
+    **Observations**, shape (355,), in [-1, 1]; t(x) stands for tanh(x):
 
     ======= ==============================================================================================
     0       distance to the left edge of the carriageway, d / 4 m - 1
@@ -66,10 +66,13 @@ class SafeDriveEnv(gym.Env):
             within 1.9 m of them
     289-306 closeness, alike, in 9 strips along the route, -3, -2.25, ..., 3 m to the right of its middle: within 0.6 m,
             then within 1.2 m
+    307-354 change of the free distance of each of these 48 since the observation before, d / 1.5 m, negative where
+            something comes nearer
     ======= ==============================================================================================
 
-    The last 48, the corridors, are computed from the others (``sb3_chac.envs.driving.corridors``): which way is free, as an
-    MLP hardly finds out from rays. ``corridors=False`` leaves them out.
+    The last 96, the corridors, are computed from the others and from those of the observation before
+    (``sb3_chac.envs.driving.corridors``): which way is free, and who drives along, as an MLP hardly finds out from rays.
+    ``corridors=False`` leaves them out.
 
     **Reward**: ``displacement_reward`` per metre of progress along the route, ``speed_reward`` v / v_max per step, less
     ``collision_penalty`` per collision, ``arrival_reward`` at the destination, less ``out_of_road_penalty`` off the
@@ -159,8 +162,8 @@ class SafeDriveEnv(gym.Env):
 
         self.action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
         self.lidar = Lidar()
-        self._corridors = Corridors(self.lidar.rays, self.lidar.reach) if corridors else None
-        n_observation = N_EGO + N_NAVIGATION + self.lidar.rays + N_CORRIDORS * corridors
+        self._corridors = CorridorView(self.lidar.rays, self.lidar.reach) if corridors else None
+        n_observation = N_EGO + N_NAVIGATION + self.lidar.rays + N_VIEW * corridors
         self.observation_space = spaces.Box(-1.0, 1.0, (n_observation,), np.float32)
         self._scenes: OrderedDict[int, Scene] = OrderedDict()
         self._viewer: Any = None
@@ -208,6 +211,8 @@ class SafeDriveEnv(gym.Env):
         self._touched: dict[tuple[str, int], int] = {}  # object -> step of the last contact
         self._tow: dict[int, int] = {}  # parked vehicle that was hit -> step at which it is gone
         self._find_boxes()
+        if self._corridors is not None:
+            self._corridors.reset()
         if self.render_mode == "human":
             self.render()
         return self._observe(), self._info()
