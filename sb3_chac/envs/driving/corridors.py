@@ -1,6 +1,7 @@
 """Corridors: how far the ways ahead are free, computed from a lidar scan and a route that are in the observation already."""
 
 import numpy as np
+from gymnasium import spaces
 
 from sb3_chac.envs.driving.compiled import compiled
 
@@ -104,3 +105,21 @@ def _strips(x: np.ndarray, y: np.ndarray, route: np.ndarray, headings: np.ndarra
                     if abs(across - LATERALS[strip]) < STRIP_HALF_WIDTHS[width]:
                         free[width, strip] = min(free[width, strip], along)
     return free
+
+
+def corridors_remedy(trained_on: spaces.Space | None, given: spaces.Space | None) -> str:
+    """
+    Say what to do if two observation spaces differ by the corridors alone.
+
+    :param trained_on: of a model or a dataset
+    :param given: of the environment
+    :return: a sentence, with a blank before it; empty if something else is the matter
+    """
+    sizes = [space.shape[0] if isinstance(space, spaces.Box) and len(space.shape) == 1 else 0 for space in (trained_on, given)]
+    if abs(sizes[0] - sizes[1]) != N_CORRIDORS:
+        return ""
+    flag = sizes[0] > sizes[1]
+    return (
+        f" The {sizes[0]} numbers are {'with' if flag else 'without'} corridors, the {sizes[1]} {'without' if flag else 'with'} "
+        f"them: make the environment with corridors={flag} (on the command line: --env-kwargs corridors:{flag})."
+    )

@@ -54,7 +54,7 @@ class SafeDriveEnv(gym.Env):
     **Actions**, shape (2,), in [-1, 1]: steering (1 is 0.6 rad of the front wheels to the right) and acceleration (1 is
     4 m/s2, -1 brakes as much; the vehicle does not drive backwards; top speed 15 m/s).
 
-    **Observations**, shape (259,), in [-1, 1]; t(x) stands for tanh(x):
+    **Observations**, shape (307,), in [-1, 1]; t(x) stands for tanh(x):
 
     ======= ==============================================================================================
     0       distance to the left edge of the carriageway, d / 4 m - 1
@@ -68,7 +68,15 @@ class SafeDriveEnv(gym.Env):
     9-18    checkpoints on the middle of the carriageway 8, 16, 26, 38 and 50 m ahead, each: bearing to the right,
             t(angle / 0.4), and heading of the route there, t(angle / 0.6), both against the ego's heading
     19-258  240 lidar rays, clockwise from straight ahead, as closeness: 0 free up to 50 m, 1 touching
+    259-288 closeness, 1 - d / 40 m, of the nearest lidar hit within 1.2 m of 15 arcs that lead straight on with
+            curvatures of -0.2, -0.14, -0.09, -0.06, -0.04, -0.025, -0.012, 0, 0.012, ..., 0.2 per m (to the right), then
+            within 1.9 m of them
+    289-306 closeness, alike, in 9 strips along the route, -3, -2.25, ..., 3 m to the right of its middle: within 0.6 m,
+            then within 1.2 m
     ======= ==============================================================================================
+
+    The last 48, the corridors, are computed from the others (``sb3_chac.envs.driving.corridors``): which way is free, as an
+    MLP hardly finds out from rays. ``corridors=False`` leaves them out.
 
     **Reward**: ``displacement_reward`` per metre of progress along the route, ``speed_reward`` v / v_max per step, less
     ``collision_penalty`` per collision, ``arrival_reward`` at the destination, less ``out_of_road_penalty`` off the
