@@ -3,6 +3,8 @@
 import numpy as np
 from gymnasium import spaces
 
+from sb3_chac.envs.driving.compiled import compiled
+
 FAR = 40.0  # [m] farther hits count as none
 # [1/m] of circular arcs from the ego's position, tangent to its heading
 CURVATURES = np.array([-0.2, -0.14, -0.09, -0.06, -0.04, -0.025, -0.012, 0, 0.012, 0.025, 0.04, 0.06, 0.09, 0.14, 0.2])
@@ -33,12 +35,6 @@ class Corridors:
         self.reach = reach
         self.ahead = np.flatnonzero(np.cos(angles) > 1e-9)
         self.cos, self.sin = np.cos(angles[self.ahead]), np.sin(angles[self.ahead])
-        # A point is |k| (x^2 + y^2) / 2 - sign(k) y from an arc of curvature k, up to terms of second order, which are
-        # in the bounds: -w + |k| w^2 / 2 and w + |k| w^2 / 2 are where the distance is exactly w
-        self.bend = np.abs(CURVATURES)[:, None]
-        self.side = np.where(CURVATURES < 0, -1.0, 1.0)[:, None]
-        self.arc_centers = (self.bend * ARC_HALF_WIDTHS**2 / 2).T[:, :, None]
-        self.arc_half_widths = ARC_HALF_WIDTHS[:, None, None]
 
     def __call__(self, closeness: np.ndarray, route: np.ndarray, headings: np.ndarray) -> np.ndarray:
         """
@@ -56,38 +52,61 @@ class Corridors:
         if len(hit):
             distances = (1.0 - closeness[hit]) * self.reach
             x, y = distances * self.cos[hit], distances * self.sin[hit]
-            free[:N_ARCS] = self._arcs(np.maximum(x, 1e-6), y).ravel()
-            free[N_ARCS:] = self._strips(x, y, route, headings).ravel()
+            free[:N_ARCS] = _arcs(np.maximum(x, 1e-6), y).ravel()
+            free[N_ARCS:] = _strips(x, y, route, headings).ravel()
         return 1.0 - np.minimum(free, FAR) / FAR
 
-    def _arcs(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """
-        Measure along the arcs.
 
-        :return: [m] to the nearest hit along each arc, at least ``FAR`` if there is none, shape (widths, curvatures)
-        """
-        inwards = self.side * y
-        offset = self.bend * ((x * x + y * y) / 2) - inwards
-        cotangent = (1.0 - self.bend * inwards) / x  # of the angle along the arc, times |k|: the nearest hit has the greatest
-        inside = np.abs(offset - self.arc_centers) < self.arc_half_widths
-        nearest = np.where(inside, cotangent, -np.inf).max(axis=2)
-        bend = np.maximum(self.bend[:, 0], 1e-9)
-        return np.where(nearest > -np.inf, np.arctan2(bend, nearest) / bend, FAR)
+@compiled
+def _arcs(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """
+    Measure along the arcs.
 
-    @staticmethod
-    def _strips(x: np.ndarray, y: np.ndarray, route: np.ndarray, headings: np.ndarray) -> np.ndarray:
-        """
-        Project the hits on the nearest points of the route.
+    A point is |k| (x^2 + y^2) / 2 - sign(k) y from an arc of curvature k, up to terms of second order, which are in the
+    bounds: -w + |k| w^2 / 2 and w + |k| w^2 / 2 are where the distance is exactly w.
 
-        :return: [m] to the nearest hit along each strip, at least ``FAR`` if there is none, shape (widths, laterals)
-        """
-        nearest = (x[:, None] * route[:, 0] + y[:, None] * route[:, 1] - (route * route).sum(axis=1) / 2).argmax(axis=1)
-        cos, sin = np.cos(headings)[nearest], np.sin(headings)[nearest]
-        dx, dy = x - route[nearest, 0], y - route[nearest, 1]
-        along = nearest * ROUTE_SPACING + dx * cos + dy * sin
-        along = np.where(along > STRIPS_BEGIN, along, FAR)
-        inside = np.abs(dy * cos - dx * sin - LATERALS[:, None]) < STRIP_HALF_WIDTHS[:, None, None]
-        return np.where(inside, along, FAR).min(axis=2)
+    :param x: [m] of the hits ahead, greater than 0; with y, shape (hits,)
+    :return: [m] to the nearest hit along each arc, at least ``FAR`` if there is none, shape (widths, curvatures)
+    """
+    free = np.full((len(ARC_HALF_WIDTHS), len(CURVATURES)), FAR)
+    nearest = np.empty(len(ARC_HALF_WIDTHS))
+    for arc in range(len(CURVATURES)):
+        bend, side = abs(CURVATURES[arc]), -1.0 if CURVATURES[arc] < 0 else 1.0
+        nearest[:] = -np.inf
+        for hit in range(len(x)):
+            inwards = side * y[hit]
+            offset = bend * ((x[hit] * x[hit] + y[hit] * y[hit]) / 2) - inwards
+            cotangent = (1.0 - bend * inwards) / x[hit]  # of the angle along the arc, times |k|: greatest at the nearest hit
+            for width in range(len(ARC_HALF_WIDTHS)):
+                half_width = ARC_HALF_WIDTHS[width]
+                if abs(offset - bend * half_width**2 / 2) < half_width:
+                    nearest[width] = max(nearest[width], cotangent)
+        for width in range(len(ARC_HALF_WIDTHS)):
+            if nearest[width] > -np.inf:
+                free[width, arc] = np.arctan2(max(bend, 1e-9), nearest[width]) / max(bend, 1e-9)
+    return free
+
+
+@compiled
+def _strips(x: np.ndarray, y: np.ndarray, route: np.ndarray, headings: np.ndarray) -> np.ndarray:
+    """
+    Project the hits on the nearest points of the route.
+
+    :return: [m] to the nearest hit along each strip, at least ``FAR`` if there is none, shape (widths, laterals)
+    """
+    free = np.full((len(STRIP_HALF_WIDTHS), len(LATERALS)), FAR)
+    half_squares = (route[:, 0] * route[:, 0] + route[:, 1] * route[:, 1]) / 2
+    for hit in range(len(x)):
+        nearest = np.argmax(x[hit] * route[:, 0] + y[hit] * route[:, 1] - half_squares)
+        cos, sin = np.cos(headings[nearest]), np.sin(headings[nearest])
+        dx, dy = x[hit] - route[nearest, 0], y[hit] - route[nearest, 1]
+        along, across = nearest * ROUTE_SPACING + dx * cos + dy * sin, dy * cos - dx * sin
+        if along > STRIPS_BEGIN:
+            for width in range(len(STRIP_HALF_WIDTHS)):
+                for strip in range(len(LATERALS)):
+                    if abs(across - LATERALS[strip]) < STRIP_HALF_WIDTHS[width]:
+                        free[width, strip] = min(free[width, strip], along)
+    return free
 
 
 class CorridorView:
