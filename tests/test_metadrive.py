@@ -76,18 +76,17 @@ def test_observations_are_scaled(env):
     env.simulator.reset = lambda **kwargs: own.append(observe(**kwargs)) or own[-1]
     observation, _ = env.reset(options={"scenario": 100})
     raw = np.clip(own[0][0], 0, 1)
-    np.testing.assert_allclose(observation[19:], 1 - raw[19:], atol=1e-6)  # closeness
+    np.testing.assert_allclose(observation[19:259], 1 - raw[19:], atol=1e-6)  # closeness
     np.testing.assert_allclose(observation[3], (raw[3] - 0.75) / 0.2, rtol=1e-4)  # speed
     assert env.observation_space.contains(observation)
     low, high = env.observation_space.low, env.observation_space.high
     np.testing.assert_allclose(low[3], -0.75 / 0.2)
     np.testing.assert_allclose([low[19], high[19]], [0, 1])
-    env.raw_observations = True
-    observation, _ = env.reset(options={"scenario": 100})
-    np.testing.assert_allclose(observation, raw, atol=1e-4)
     env.close()
     env = MetaDriveSafetyEnv(raw_observations=True, headless=True)
     assert (env.observation_space.low == 0).all() and (env.observation_space.high == 1).all()
+    observation, _ = env.reset(options={"scenario": 100})
+    np.testing.assert_allclose(observation, raw, atol=1e-4)
     env.close()
 
 
@@ -145,7 +144,7 @@ def test_same_scenario_and_actions_give_the_same_episode(env):
     "argument",
     [
         {"preset": "paper"}, {"start_scenario": -1}, {"num_scenarios": 0}, {"traffic_density": 2.0}, {"max_speed": 0.0},
-        {"horizon": 0}, {"render_mode": "3d"},
+        {"horizon": 0}, {"contact_limit": 0}, {"render_mode": "3d"},
     ],
 )  # fmt: skip
 def test_arguments_out_of_range(argument):
@@ -220,6 +219,19 @@ def test_collision_replaces_the_reward(env):
         if info["contact"]:
             break
     assert reward == -5.0
+
+
+@needs_metadrive
+@pytest.mark.parametrize(
+    ("limit", "every", "end"),  # steps between two touches, step at which the episode is truncated
+    [(30, 1, 30), (30, 8, 40), (30, 15, None), (None, 1, None)],
+)
+def test_a_contact_that_lasts_truncates_the_episode(env, monkeypatch, limit, every, end):
+    env.contact_limit = limit
+    env.reset(options={"scenario": 3003})
+    monkeypatch.setattr(env, "_touching", lambda vehicles, objects: {"somebody"} if env.steps % every == 0 else set())
+    ends = [env.step(np.zeros(2))[2:4] for _ in range(end or 60)]
+    assert ends[:-1] == [(False, False)] * (len(ends) - 1) and ends[-1] == (False, end is not None)
 
 
 @needs_metadrive

@@ -28,11 +28,12 @@ class Corridors:
 
     :param rays: number of lidar rays, in equal steps around the vehicle, ray 0 straight ahead
     :param reach: [m] of the rays
+    :param laterals: [m] offsets of the strips' middles from that of the route, shape (9,)
     """
 
-    def __init__(self, rays: int, reach: float) -> None:
+    def __init__(self, rays: int, reach: float, laterals: np.ndarray = LATERALS) -> None:
         angles = np.arange(rays) * 2 * np.pi / rays
-        self.reach = reach
+        self.reach, self.laterals = reach, laterals
         self.ahead = np.flatnonzero(np.cos(angles) > 1e-9)
         self.cos, self.sin = np.cos(angles[self.ahead]), np.sin(angles[self.ahead])
 
@@ -53,7 +54,7 @@ class Corridors:
             distances = (1.0 - closeness[hit]) * self.reach
             x, y = distances * self.cos[hit], distances * self.sin[hit]
             free[:N_ARCS] = _arcs(np.maximum(x, 1e-6), y).ravel()
-            free[N_ARCS:] = _strips(x, y, route, headings).ravel()
+            free[N_ARCS:] = _strips(x, y, route, headings, self.laterals).ravel()
         return 1.0 - np.minimum(free, FAR) / FAR
 
 
@@ -88,13 +89,14 @@ def _arcs(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 @compiled
-def _strips(x: np.ndarray, y: np.ndarray, route: np.ndarray, headings: np.ndarray) -> np.ndarray:
+def _strips(x: np.ndarray, y: np.ndarray, route: np.ndarray, headings: np.ndarray, laterals: np.ndarray) -> np.ndarray:
     """
     Project the hits on the nearest points of the route.
 
+    :param laterals: [m] offsets of the strips' middles from the route
     :return: [m] to the nearest hit along each strip, at least ``FAR`` if there is none, shape (widths, laterals)
     """
-    free = np.full((len(STRIP_HALF_WIDTHS), len(LATERALS)), FAR)
+    free = np.full((len(STRIP_HALF_WIDTHS), len(laterals)), FAR)
     half_squares = (route[:, 0] * route[:, 0] + route[:, 1] * route[:, 1]) / 2
     for hit in range(len(x)):
         nearest = np.argmax(x[hit] * route[:, 0] + y[hit] * route[:, 1] - half_squares)
@@ -103,10 +105,28 @@ def _strips(x: np.ndarray, y: np.ndarray, route: np.ndarray, headings: np.ndarra
         along, across = nearest * ROUTE_SPACING + dx * cos + dy * sin, dy * cos - dx * sin
         if along > STRIPS_BEGIN:
             for width in range(len(STRIP_HALF_WIDTHS)):
-                for strip in range(len(LATERALS)):
-                    if abs(across - LATERALS[strip]) < STRIP_HALF_WIDTHS[width]:
+                for strip in range(len(laterals)):
+                    if abs(across - laterals[strip]) < STRIP_HALF_WIDTHS[width]:
                         free[width, strip] = min(free[width, strip], along)
     return free
+
+
+@compiled
+def route_along(x: float, y: float, headings: np.ndarray) -> np.ndarray:
+    """
+    Integrate the headings of a route.
+
+    :param x: [m] of its first point, with ``y``
+    :param headings: [rad] at its points, which are ``ROUTE_SPACING`` apart, shape (n,)
+    :return: [m] its points, shape (n, 2)
+    """
+    cos, sin = np.cos(headings), np.sin(headings)
+    route = np.empty((len(headings), 2))
+    route[0, 0], route[0, 1] = x, y
+    for i in range(1, len(headings)):
+        route[i, 0] = route[i - 1, 0] + (cos[i] + cos[i - 1]) * (ROUTE_SPACING / 2)
+        route[i, 1] = route[i - 1, 1] + (sin[i] + sin[i - 1]) * (ROUTE_SPACING / 2)
+    return route
 
 
 class CorridorView:
@@ -115,12 +135,11 @@ class CorridorView:
     drives, what drives along does not. Without the change a policy takes a lane for blocked in which all go on at its speed,
     stays in the other one, and runs into what stands there.
 
-    :param rays: see ``Corridors``
-    :param reach: [m], alike
+    The parameters are those of ``Corridors``.
     """
 
-    def __init__(self, rays: int, reach: float) -> None:
-        self.corridors = Corridors(rays, reach)
+    def __init__(self, rays: int, reach: float, laterals: np.ndarray = LATERALS) -> None:
+        self.corridors = Corridors(rays, reach, laterals)
         self.reset()
 
     def reset(self) -> None:
