@@ -1,6 +1,7 @@
 """One replay buffer with two stores: what the novice drove, and what the human drove."""
 
 from collections import defaultdict, deque
+from itertools import chain
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -84,8 +85,19 @@ class TransitionStore:
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
         filled, self.arrays = self.arrays, self._allocate()
-        for name, array in filled.items():  # one pickled before a column existed has zeros there
+        for name, array in filled.items():
             self.arrays[name][: len(array)] = array
+
+    def complete(self, columns: dict[str, tuple[tuple[int, ...], Any]]) -> None:
+        """
+        Add the columns that are missing in a store of an older version, with zeros.
+
+        :param columns: see the constructor
+        """
+        for name, (shape, dtype) in columns.items():
+            if name not in self.columns:
+                self.columns = {**self.columns, name: (shape, dtype)}
+                self.arrays[name] = np.zeros((self.capacity, *shape), dtype)
 
 
 class DualReplayBuffer(ReplayBuffer):
@@ -144,6 +156,13 @@ class DualReplayBuffer(ReplayBuffer):
         self.human = TransitionStore(buffer_size, columns)
         # Transitions of each environment whose return is not complete yet
         self.pending: defaultdict[int, deque[dict[str, Any]]] = defaultdict(deque)
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        for store in (self.novice, self.human):
+            store.complete(dict.fromkeys(SCALARS, ((1,), np.float32)))
+        for row in chain.from_iterable(self.pending.values()):
+            row |= {name: np.zeros(1, np.float32) for name in SCALARS if name not in row}
 
     def size(self) -> int:
         """
