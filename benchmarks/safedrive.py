@@ -29,6 +29,7 @@ from stable_baselines3.common.callbacks import BaseCallback, EveryNTimesteps
 import sb3_chac.envs  # noqa: F401
 from sb3_chac.common.evaluation import evaluate
 from sb3_chac.envs.safedrive.driver import ScriptedDriver
+from sb3_chac.envs.safedrive.env import N_STATE, route_ahead
 from sb3_chac.envs.safedrive.geometry import boxes_overlap
 from sb3_chac.envs.safedrive.traffic import CAR_LENGTH, CAR_WIDTH
 from sb3_chac.human import InterventionWrapper
@@ -133,15 +134,25 @@ def reference_loop(n: int) -> float:
     return time.process_time() - start
 
 
+def time_corridors(env, observations: list[np.ndarray]) -> float:
+    """CPU seconds that the corridors of one observation take, the route rebuilt from it included."""
+    start = time.process_time()
+    for observation in observations:
+        env._corridors(observation[N_STATE : N_STATE + env.lidar.rays], *route_ahead(observation))
+    return (time.process_time() - start) / len(observations)
+
+
 def speed(args: argparse.Namespace) -> None:
-    """Ten rounds that take turns with the reference loop; the driver's own time is not counted."""
+    """Ten rounds that take turns with the reference loop; the driver's time and that of compilation are not counted."""
     env = gym.make("SafeDrive-v0").unwrapped
     driver = env.scripted_driver("scripted")
     for scenario in range(100, 120):
         env.reset(options={"scenario": scenario})
+        env.step(driver())
     rows = []
     for part in range(10):
         steps = cpu = 0.0
+        observations = []
         for scenario in range(100 + 2 * part, 102 + 2 * part):
             env.reset(options={"scenario": scenario})
             driver.reset(scenario)
@@ -149,16 +160,19 @@ def speed(args: argparse.Namespace) -> None:
             while not done:
                 action = driver()
                 start = time.process_time()
-                _, _, terminated, truncated, _ = env.step(action)
+                observation, _, terminated, truncated, _ = env.step(action)
                 cpu += time.process_time() - start
+                observations.append(observation)
                 steps, done = steps + 1, terminated or truncated
         reference = reference_loop(20_000)
         row = {"part": part, "steps": int(steps), "cpu_seconds": round(cpu, 4), "steps_per_cpu_second": round(steps / cpu, 1)}
+        row |= {"corridors_us": round(time_corridors(env, observations) * 1e6, 1)}
         rows.append({**row, "reference_us": round(reference / 20_000 * 1e6, 3), "versions": VERSIONS})
     rates = [row["steps_per_cpu_second"] for row in rows]
     per_reference = np.mean([1e6 / row["steps_per_cpu_second"] / row["reference_us"] for row in rows])
     print(
         f"{np.mean(rates):.0f} steps per CPU second (least {min(rates):.0f}); a step costs {per_reference:.1f} reference loops"
+        f"; the corridors take {np.mean([row['corridors_us'] for row in rows]):.0f} us"
     )
     write("speed.csv", rows)
 

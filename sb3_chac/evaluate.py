@@ -16,6 +16,7 @@ import torch as th
 from huggingface_sb3 import EnvironmentName
 from rl_zoo3 import utils
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_chac.chac import CHAC
@@ -24,6 +25,7 @@ from sb3_chac.common import pictures
 from sb3_chac.common.episodes import NotEvaluable, Runner, SavedModel, Task, make_env
 from sb3_chac.common.evaluation import Evaluation, compare, evaluate, scenario_list
 from sb3_chac.envs import ENVIRONMENTS
+from sb3_chac.envs.driving.corridors import corridors_remedy
 from sb3_chac.zoo.registration import add_algorithms
 
 DEFAULT_ENV = "SafeDrive-v0"
@@ -335,12 +337,25 @@ def load_model(
     try:
         model = SavedModel(algorithm, path.read_bytes(), control).load(env)
     except Exception as error:  # whatever a model of another algorithm, version or environment leads to
-        raise NotEvaluable(
-            f"{path} cannot be loaded as {algo} for {env.unwrapped}: {error or type(error).__name__}"
-        ) from error
+        reason = f"{error or type(error).__name__}{remedy_for(path, env)}"
+        raise NotEvaluable(f"{path} cannot be loaded as {algo} for {env.unwrapped}: {reason}") from error
     if control in ("self", "shared") and isinstance(model, CHAC) and model.stage == 1:
         raise NotEvaluable(f"{path} is in stage 1, where the guided policy acts alone: there is no {control!r} yet.")
     return model
+
+
+def remedy_for(path: Path, env: gym.Env) -> str:
+    """
+    Say how to make the environment that a saved model fits, if that is known.
+
+    :return: a sentence, with a full stop and a blank before it, or ""
+    """
+    try:
+        data, _, _ = load_from_zip_file(path, device="cpu")
+    except Exception:  # that is why it cannot be loaded
+        return ""
+    remedy = corridors_remedy((data or {}).get("observation_space"), env.observation_space)
+    return remedy and f".{remedy}"
 
 
 def find_normalization(model: Path, env: str) -> tuple[Path, VecNormalize | None]:

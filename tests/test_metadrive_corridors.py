@@ -3,7 +3,7 @@ import importlib.util
 import numpy as np
 import pytest
 
-from sb3_chac.envs.driving.corridors import N_CORRIDORS, Corridors
+from sb3_chac.envs.driving.corridors import N_CORRIDORS, N_VIEW, Corridors
 from sb3_chac.envs.metadrive import MetaDriveSafetyEnv
 from sb3_chac.envs.metadrive.env import LIDAR_REACH, N_LIDAR, OFFSET, ROUTE, SCALE, STRIPS, route_ahead
 
@@ -105,14 +105,17 @@ def test_corridors_are_a_bounded_function_of_the_observation_alone(env):
     rng = np.random.default_rng(0)
     raw = [rng.random(259), rng.integers(0, 2, 259).astype(float), np.zeros(259), np.ones(259), *rng.random((20, 259)) ** 3]
     env.reset(options={"scenario": 2000})
+    env._corridors.reset()
     before = [env._observed(values) for values in raw]
     env.reset(options={"scenario": 2003})
     for _ in range(5):
         env.step(np.array([0.3, 1.0]))
+    env._corridors.reset()
     for values, expected in zip(raw, before, strict=True):
         np.testing.assert_array_equal(env._observed(values), expected)
         assert env.observation_space.contains(expected) and np.abs(expected[259:]).max() <= 1.0
-    assert (env.observation_space.low[259:] == 0).all() and (env.observation_space.high[259:] == 1).all()
+    low, high = env.observation_space.low[259:], env.observation_space.high[259:]
+    assert (low[:N_CORRIDORS] == 0).all() and (low[N_CORRIDORS:] == -1).all() and (high == 1).all()
 
 
 @needs_metadrive
@@ -152,7 +155,7 @@ def test_rays_point_where_things_are(env):
 @needs_metadrive
 def test_without_corridors_the_observation_is_the_same_but_shorter(env):
     observation, _ = env.reset(options={"scenario": 2000})
-    assert observation.shape == env.observation_space.shape == (259 + N_CORRIDORS,)
+    assert observation.shape == env.observation_space.shape == (259 + N_VIEW,)
     env.close()
     for arguments, shape in (({"corridors": False}, (259,)), ({"raw_observations": True}, (259,))):
         other = MetaDriveSafetyEnv(headless=True, **arguments)

@@ -9,10 +9,10 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.sac.policies import Actor
 
 from sb3_chac.chac.policies import CONTROLS, CHACPolicy, CnnPolicy, MlpPolicy, MultiInputPolicy
-from sb3_chac.common.buffers import DualReplayBuffer, DualReplayBufferSamples
+from sb3_chac.common.buffers import DualReplayBuffer, DualReplayBufferSamples, take_rows
 from sb3_chac.common.checks import check_integer, check_range
 from sb3_chac.common.critics import DistributionalCritic
-from sb3_chac.common.distributional import return_targets
+from sb3_chac.common.distributional import gaussian_surrogate_loss, return_targets
 from sb3_chac.common.utils import TargetUpdate, minimize
 from sb3_chac.dpvp.dpvp import DPVP
 
@@ -46,6 +46,12 @@ class CHAC(DPVP):
     - In stage 2, Z_c bootstraps on what is executed, not on pi_r alone (``bootstrap``).
     - pi_r exploits what Z_c believes of actions that nobody has tried, and leaves the road in most episodes after the switch.
       It is tied to pi_g: it maximises Q_c - alpha log pi_r - anchor_coef ||a_r - a_g||^2 (``anchor_coef``).
+    - Z_c learns rewards in units of their root mean square (``normalize_rewards``), so that stage 2 does the same whatever the
+      scale of a task's reward.
+    - The return hardly shows a collision (5 of 370 on SafeDrive): the safety cost is subtracted from the reward that Z_c
+      learns (``cost_coef``).
+    - In stage 1 nothing bad happens, since the human takes over before: Z_c would first learn in stage 2, by accidents, what
+      they cost. It is told: what the novice proposed where the human took over counts as ``takeover_cost`` of an accident.
 
     ``preset`` fills in the arguments that are None, those of ``DPVP`` and:
 
@@ -58,6 +64,9 @@ class CHAC(DPVP):
     bootstrap           "executed"  "self"
     stage2_human_share  0.25        0
     anchor_coef         20          0
+    normalize_rewards   True        False
+    cost_coef           60          0
+    takeover_cost       0.0         0
     ==================  ==========  =======
 
     The parameters are those of ``DPVP``, and:
@@ -76,7 +85,10 @@ class CHAC(DPVP):
     :param bootstrap: "executed": Z_c evaluates what is executed in stage 2 (shared control); "self": pi_r
     :param stage2_human_share: share of the human's transitions in the batches of stage 2
     :param anchor_coef: weight of the squared distance between the actions of pi_r and pi_g, both in [-1, 1], in pi_r's loss;
-        in units of the return
+        in units of what Z_c learns
+    :param normalize_rewards: whether Z_c learns rewards in units of their running root mean square
+    :param cost_coef: what ``info["cost"]`` counts against (normalised) rewards in Z_c
+    :param takeover_cost: safety cost of the novice's action where the human drives, in Z_c; 0 leaves these labels out
     :raises ValueError: for an argument out of its range, an action space that is not a bounded Box, or, while learning,
         an observation or reward that is NaN or infinite
     """
@@ -90,9 +102,13 @@ class CHAC(DPVP):
             "bootstrap": "executed",
             "stage2_human_share": 0.25,
             "anchor_coef": 20.0,
+            "normalize_rewards": True,
+            "cost_coef": 60.0,
+            "takeover_cost": 0.0,
         },
         "paper": DPVP.presets["paper"]
-        | {"sigma_scale": 1.0, "prefit_steps": 0, "bootstrap": "self", "stage2_human_share": 0.0, "anchor_coef": 0.0},
+        | {"sigma_scale": 1.0, "prefit_steps": 0, "bootstrap": "self", "stage2_human_share": 0.0, "anchor_coef": 0.0}
+        | {"normalize_rewards": False, "cost_coef": 0.0, "takeover_cost": 0.0},
     }
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
         "MlpPolicy": MlpPolicy,
@@ -151,6 +167,9 @@ class CHAC(DPVP):
         bootstrap: str | None = None,
         stage2_human_share: float | None = None,
         anchor_coef: float | None = None,
+        normalize_rewards: bool | None = None,
+        cost_coef: float | None = None,
+        takeover_cost: float | None = None,
         use_sde: bool = False,
         sde_sample_freq: int = -1,
         use_sde_at_warmup: bool = False,
@@ -218,12 +237,17 @@ class CHAC(DPVP):
         self.bootstrap: Any = bootstrap
         self.stage2_human_share: Any = stage2_human_share
         self.anchor_coef: Any = anchor_coef
+        self.normalize_rewards: Any = normalize_rewards
+        self.cost_coef: Any = cost_coef
+        self.takeover_cost: Any = takeover_cost
 
         if _init_setup_model:
             self._setup_model()
 
     def _setup_model(self) -> None:
         super()._setup_model()
+        if not hasattr(self, "reward_square"):  # else it was loaded
+            self.reward_square, self.n_reward_updates = 1.0, 0
         self.policy.delta, self.policy.sigma_scale = self.delta, self.sigma_scale
         self.policy.control = "shared" if self.shared_control else "self"
         self.confidence_update = TargetUpdate(self.confidence_critic, self.confidence_critic_target)
@@ -253,6 +277,8 @@ class CHAC(DPVP):
         check_integer("prefit_steps", self.prefit_steps, low=0)
         check_range("stage2_human_share", self.stage2_human_share, low=0.0, high=1.0)
         check_range("anchor_coef", self.anchor_coef, low=0.0)
+        check_range("cost_coef", self.cost_coef, low=0.0)
+        check_range("takeover_cost", self.takeover_cost, low=0.0)
         if self.bootstrap not in ("executed", "self"):
             raise ValueError(f"bootstrap must be 'executed' or 'self', got {self.bootstrap!r}.")
 
@@ -302,7 +328,7 @@ class CHAC(DPVP):
     def _update_confidence_critic(self, batch: DualReplayBufferSamples) -> dict[str, th.Tensor]:
         """Z_c evaluates, with reward, what is executed."""
         ent_coef = self.log_ent_coef.detach().exp()
-        rewards, target = batch.rewards.flatten(), self.confidence_critic_target
+        rewards, target = self._confidence_rewards(batch), self.confidence_critic_target
         if self.stage == 1:
             targets = self._return_targets(self.actor_target, target, batch, rewards, ent_coef)
         elif self.bootstrap == "self" or not self.shared_control:
@@ -310,9 +336,33 @@ class CHAC(DPVP):
         else:
             targets = self._shared_return_targets(batch, rewards, ent_coef)
         losses, _, stats = self._critic_losses(self.confidence_critic, batch, targets, self.eta_c)
-        minimize(losses.mean(dim=1).sum(), self.confidence_critic.optimizer)
+        loss = losses.mean(dim=1).sum()
+        human = batch.takeovers.flatten().nonzero().flatten()
+        if self.takeover_cost > 0 and len(human) > 0:
+            penalty = self.cost_coef * self.takeover_cost
+            q_novice, std_novice = self.confidence_critic(take_rows(batch.observations, human), batch.novice_actions[human])
+            differ = (batch.actions - batch.novice_actions)[human].square().mean(dim=1).sqrt() >= self.pv_min_diff
+            shifted = (t[human] - penalty for t in targets)
+            eta = self.eta if self.eta_c is None else self.eta_c
+            labels = gaussian_surrogate_loss(q_novice, std_novice, *shifted, self.confidence_critic.mean_std, eta)
+            loss = loss + (labels * differ).sum() / len(batch.takeovers)
+        minimize(loss, self.confidence_critic.optimizer)
         self.confidence_update(self.tau if self.tau_c is None else self.tau_c)
         return {f"confidence_{name}": value for name, value in stats.items()}
+
+    def _confidence_rewards(self, batch: DualReplayBufferSamples) -> th.Tensor:
+        """
+        Rewards in units of their root mean square, less what safety costs.
+
+        :return: shape (batch_size,)
+        """
+        rewards = batch.rewards.flatten()
+        if self.normalize_rewards:
+            self.n_reward_updates += 1
+            step = max(1e-3, 1 / self.n_reward_updates)
+            self.reward_square += step * (rewards.square().mean().item() - self.reward_square)
+            rewards = rewards / max(self.reward_square**0.5, 1e-8)
+        return rewards - self.cost_coef * batch.costs.flatten()
 
     @th.no_grad()
     def _shared_return_targets(

@@ -1,6 +1,7 @@
 """One replay buffer with two stores: what the novice drove, and what the human drove."""
 
 from collections import defaultdict, deque
+from itertools import chain
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,6 +14,8 @@ from stable_baselines3.common.vec_env import VecNormalize
 from sb3_chac.common.checks import check_integer, check_range
 
 Observation = np.ndarray | dict[str, np.ndarray]
+# Columns of a store with one number a row
+SCALARS = ("reward", "discount", "done", "takeover", "takeover_start", "cost")
 
 
 class DualReplayBufferSamples(NamedTuple):
@@ -27,6 +30,7 @@ class DualReplayBufferSamples(NamedTuple):
     novice_actions: th.Tensor  # a_n, what the novice would have done
     takeovers: th.Tensor  # I, 1 where the human drove
     takeover_starts: th.Tensor  # 1 on the first step of a takeover
+    costs: th.Tensor  # safety costs, summed up as the rewards are
 
 
 def take_rows(observations: th.Tensor | TensorDict, rows: th.Tensor) -> Any:
@@ -84,6 +88,17 @@ class TransitionStore:
         for name, array in filled.items():
             self.arrays[name][: len(array)] = array
 
+    def complete(self, columns: dict[str, tuple[tuple[int, ...], Any]]) -> None:
+        """
+        Add the columns that are missing in a store of an older version, with zeros.
+
+        :param columns: see the constructor
+        """
+        for name, (shape, dtype) in columns.items():
+            if name not in self.columns:
+                self.columns = {**self.columns, name: (shape, dtype)}
+                self.arrays[name] = np.zeros((self.capacity, *shape), dtype)
+
 
 class DualReplayBuffer(ReplayBuffer):
     """
@@ -136,11 +151,18 @@ class DualReplayBuffer(ReplayBuffer):
             for key, space in spaces_by_key.items()
         }
         columns |= {name: ((self.action_dim,), np.float32) for name in ("action", "novice_action")}
-        columns |= {name: ((1,), np.float32) for name in ("reward", "discount", "done", "takeover", "takeover_start")}
+        columns |= {name: ((1,), np.float32) for name in SCALARS}
         self.novice = TransitionStore(buffer_size, columns)
         self.human = TransitionStore(buffer_size, columns)
         # Transitions of each environment whose return is not complete yet
         self.pending: defaultdict[int, deque[dict[str, Any]]] = defaultdict(deque)
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        for store in (self.novice, self.human):
+            store.complete(dict.fromkeys(SCALARS, ((1,), np.float32)))
+        for row in chain.from_iterable(self.pending.values()):
+            row |= {name: np.zeros(1, np.float32) for name in SCALARS if name not in row}
 
     def size(self) -> int:
         """
@@ -165,7 +187,8 @@ class DualReplayBuffer(ReplayBuffer):
         :param obs: shape (n_envs, ...), or a dictionary of such arrays, as ``next_obs``
         :param action: a_b, executed, scaled to [-1, 1], shape (n_envs, action_dim)
         :param reward: shape (n_envs,), as ``done``
-        :param infos: "takeover", "takeover_start" and "novice_action" (a_n, scaled; ``action`` if it is not there) are used
+        :param infos: "takeover", "takeover_start", "cost" and "novice_action" (a_n, scaled; ``action`` if it is not there)
+            are used
         """
         for idx, info in enumerate(infos):
             is_timeout = self.handle_timeout_termination and info.get("TimeLimit.truncated", False)
@@ -179,6 +202,7 @@ class DualReplayBuffer(ReplayBuffer):
                 "done": done[idx] and not is_timeout,
                 "takeover": bool(info.get("takeover", False)),
                 "takeover_start": bool(info.get("takeover_start", False)),
+                "cost": float(info.get("cost", 0.0)),
             }
             if self.n_steps == 1:
                 self._append(row)
@@ -202,8 +226,8 @@ class DualReplayBuffer(ReplayBuffer):
     def _append_return(self, pending: deque[dict[str, Any]]) -> None:
         """Completes the oldest transition: rewards up to the last one, then its next observation."""
         ends = {name: value for name, value in pending[-1].items() if name == "done" or name.startswith("next_observation/")}
-        rewards = sum(self.gamma**k * row["reward"] for k, row in enumerate(pending))
-        self._append(pending.popleft() | ends | {"reward": rewards, "discount": self.gamma ** (len(pending) + 1)})
+        sums = {name: sum(self.gamma**k * row[name] for k, row in enumerate(pending)) for name in ("reward", "cost")}
+        self._append(pending.popleft() | ends | sums | {"discount": self.gamma ** (len(pending) + 1)})
 
     def _flush(self, pending: deque[dict[str, Any]]) -> None:
         while pending:
@@ -250,6 +274,7 @@ class DualReplayBuffer(ReplayBuffer):
             to_torch["novice_action"],
             to_torch["takeover"],
             to_torch["takeover_start"],
+            to_torch["cost"],
         )
 
     def _observations(self, kind: str, columns: dict[str, np.ndarray], env: VecNormalize | None) -> Any:

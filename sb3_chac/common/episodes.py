@@ -13,6 +13,7 @@ from stable_baselines3.common.utils import FloatSchedule, check_for_correct_spac
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 import sb3_chac.envs  # noqa: F401  (registers our environments)
+from sb3_chac.envs.driving.corridors import corridors_remedy
 
 # Stored with a model, but of no use for acting (a schedule may not even load in another Python version)
 NOT_FOR_ACTING = {
@@ -85,7 +86,8 @@ class ModelDriver:
             wrapped = model._wrap_env(DummyVecEnv([lambda: env]), verbose=0, monitor_wrapper=False)  # transposes images
             check_for_correct_spaces(wrapped, model.observation_space, model.action_space)
         except ValueError as error:
-            raise NotEvaluable(f"the model does not fit {env.unwrapped}: {error}") from None
+            remedy = corridors_remedy(model.observation_space, env.observation_space)
+            raise NotEvaluable(f"the model does not fit {env.unwrapped}: {error}.{remedy}") from None
         self.reset()
 
     def reset(self, seed: int = 0) -> None:

@@ -9,7 +9,7 @@ from gymnasium import spaces
 
 from sb3_chac.common.checks import check_integer, check_range
 from sb3_chac.envs.display import STEPS_PER_SECOND
-from sb3_chac.envs.driving.corridors import FAR, LATERALS, N_CORRIDORS, ROUTE_SPACING, Corridors, route_along
+from sb3_chac.envs.driving.corridors import FAR, LATERALS, N_CORRIDORS, N_VIEW, ROUTE_SPACING, CorridorView, route_along
 from sb3_chac.envs.metadrive.drivers import DRIVERS
 from sb3_chac.envs.metadrive.simulator import check_installed, is_headless, make_simulator, prepare, release
 
@@ -60,7 +60,7 @@ class MetaDriveSafetyEnv(gym.Env):
 
     **Actions**, shape (2,), in [-1, 1]: steering (1 is 40 degrees of the front wheels to the left) and throttle or brake.
 
-    **Observations**, shape (307,): MetaDrive's 259 numbers, each as (MetaDrive's - mean) / standard deviation (``MEANS``,
+    **Observations**, shape (355,): MetaDrive's 259 numbers, each as (MetaDrive's - mean) / standard deviation (``MEANS``,
     ``STDS``: about -1 to 1), rays as closeness, then the corridors. Of MetaDrive's, all in [0, 1]:
 
     ======= ==============================================================================================
@@ -77,6 +77,8 @@ class MetaDriveSafetyEnv(gym.Env):
     14-18   checkpoint at the end of the next road, alike; the same once more on the last road
     19-258  240 lidar rays, anticlockwise from straight ahead, as closeness: 0 free up to 50 m, 1 touching
     259-306 corridors, computed from the numbers above: closeness of the nearest ray's hit, 1 - d / 40 m, 0 if there is none
+    307-354 change of the free distance of each of these 48 since the observation before, d / 1.5 m, negative where
+            something comes nearer
     ======= ==============================================================================================
 
     Corridors 259-273 are along circular arcs of the curvatures -0.2 to 0.2 per metre, positive to the left (``CURVATURES`` of
@@ -164,12 +166,13 @@ class MetaDriveSafetyEnv(gym.Env):
         self.hud: dict[str, Any] = {}  # what wrappers want to have shown beside the speed
         self.action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
         self.raw_observations = bool(raw_observations)
-        self._corridors = Corridors(N_LIDAR, LIDAR_REACH, STRIPS) if corridors and not raw_observations else None
+        self._corridors = CorridorView(N_LIDAR, LIDAR_REACH, STRIPS) if corridors and not raw_observations else None
         bounds = self._scaled(np.zeros(N_OBSERVATION)), self._scaled(np.ones(N_OBSERVATION))
         low, high = np.minimum(*bounds), np.maximum(*bounds)
         if self._corridors is not None:
-            low, high = np.pad(low, (0, N_CORRIDORS)), np.pad(high, (0, N_CORRIDORS), constant_values=1.0)
-        self.observation_space = spaces.Box(low, high, dtype=np.float32)
+            low = np.concatenate([low, np.zeros(N_CORRIDORS), -np.ones(N_VIEW - N_CORRIDORS)])
+            high = np.concatenate([high, np.ones(N_VIEW)])
+        self.observation_space = spaces.Box(low.astype(np.float32), high.astype(np.float32))
         self._viewer: Any = None
         self.simulator = make_simulator(
             self,
@@ -203,6 +206,8 @@ class MetaDriveSafetyEnv(gym.Env):
         self._touched: dict[Any, int] = {}  # object -> step of the last contact
         self._contact_began: int | None = None  # the step, of a contact that lasts
         info = self._info(info)
+        if self._corridors is not None:
+            self._corridors.reset()
         if self.render_mode == "human":
             self.render()
         return self._observed(observation), info
@@ -399,7 +404,7 @@ def route_ahead(observation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     elif math.hypot(next_x, next_y) > CHECKPOINT_REACH - 0.01:
         next_length = FAR
     headings = heading + curvature * np.minimum(ROUTE, length) + next_curvature * np.clip(ROUTE - length, 0.0, next_length)
-    return route_along(start, headings), headings
+    return route_along(*start, headings), headings
 
 
 def _road(values: list[float], width: float) -> tuple[tuple[float, float], float, float]:

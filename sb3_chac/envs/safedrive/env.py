@@ -1,5 +1,6 @@
 """SafeDrive-v0: the driving task of the paper's benchmark, on highway-env."""
 
+import math
 from collections import OrderedDict
 from typing import Any, NamedTuple
 
@@ -10,7 +11,8 @@ from highway_env.road.road import Road
 
 from sb3_chac.common.checks import check_integer, check_range
 from sb3_chac.envs.display import STEPS_PER_SECOND
-from sb3_chac.envs.driving.corridors import N_CORRIDORS, ROUTE_SPACING, Corridors, route_along
+from sb3_chac.envs.driving.compiled import compiled
+from sb3_chac.envs.driving.corridors import N_VIEW, ROUTE_SPACING, CorridorView, route_along
 from sb3_chac.envs.safedrive.driver import IMPERFECTIONS, ScriptedDriver
 from sb3_chac.envs.safedrive.geometry import SPACING, Pose, boxes_overlap, wrap_angle
 from sb3_chac.envs.safedrive.lidar import Lidar
@@ -22,7 +24,12 @@ SUBSTEPS = 2
 ARRIVES_BEFORE_END = 5.0  # [m]
 CHECKPOINTS = np.array([8.0, 16.0, 26.0, 38.0, 50.0])  # [m] ahead on the route
 N_EGO, N_NAVIGATION = 9, 2 * len(CHECKPOINTS)
+N_STATE = N_EGO + N_NAVIGATION  # numbers before the lidar
 ROUTE = np.arange(0.0, CHECKPOINTS[-1] + ROUTE_SPACING / 2, ROUTE_SPACING)  # [m] where the route is rebuilt from them
+# Where the observation tells headings of the route (beside the ego, at the checkpoints), and [rad] what they are scaled by
+ROUTE_KNOTS = np.array([0.0, *CHECKPOINTS])  # [m]
+ROUTE_HEADINGS = np.array([2, *range(N_EGO + 1, N_STATE, 2)])
+ROUTE_HEADING_SCALES = np.array([-0.15] + [0.6] * len(CHECKPOINTS), np.float32)
 CONTACT_MEMORY = 10  # steps without contact after which touching the same object is a new collision
 PARKED_TOWED_AFTER = 50  # steps after a collision with a parked vehicle
 SCENES_KEPT = 64
@@ -47,7 +54,7 @@ class SafeDriveEnv(gym.Env):
     **Actions**, shape (2,), in [-1, 1]: steering (1 is 0.6 rad of the front wheels to the right) and acceleration (1 is
     4 m/s2, -1 brakes as much; the vehicle does not drive backwards; top speed 15 m/s).
 
-    **Observations**, shape (259,), in [-1, 1]; t(x) stands for tanh(x):
+    **Observations**, shape (355,), in [-1, 1]; t(x) stands for tanh(x):
 
     ======= ==============================================================================================
     0       distance to the left edge of the carriageway, d / 4 m - 1
@@ -61,7 +68,18 @@ class SafeDriveEnv(gym.Env):
     9-18    checkpoints on the middle of the carriageway 8, 16, 26, 38 and 50 m ahead, each: bearing to the right,
             t(angle / 0.4), and heading of the route there, t(angle / 0.6), both against the ego's heading
     19-258  240 lidar rays, clockwise from straight ahead, as closeness: 0 free up to 50 m, 1 touching
+    259-288 closeness, 1 - d / 40 m, of the nearest lidar hit within 1.2 m of 15 arcs that lead straight on with
+            curvatures of -0.2, -0.14, -0.09, -0.06, -0.04, -0.025, -0.012, 0, 0.012, ..., 0.2 per m (to the right), then
+            within 1.9 m of them
+    289-306 closeness, alike, in 9 strips along the route, -3, -2.25, ..., 3 m to the right of its middle: within 0.6 m,
+            then within 1.2 m
+    307-354 change of the free distance of each of these 48 since the observation before, d / 1.5 m, negative where
+            something comes nearer
     ======= ==============================================================================================
+
+    The last 96, the corridors, are computed from the others and from those of the observation before
+    (``sb3_chac.envs.driving.corridors``): which way is free, and who drives along, as an MLP hardly finds out from rays.
+    ``corridors=False`` leaves them out.
 
     **Reward**: ``displacement_reward`` per metre of progress along the route, ``speed_reward`` v / v_max per step, less
     ``collision_penalty`` per collision, ``arrival_reward`` at the destination, less ``out_of_road_penalty`` off the
@@ -151,8 +169,8 @@ class SafeDriveEnv(gym.Env):
 
         self.action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
         self.lidar = Lidar()
-        self._corridors = Corridors(self.lidar.rays, self.lidar.reach) if corridors else None
-        n_observation = N_EGO + N_NAVIGATION + self.lidar.rays + N_CORRIDORS * corridors
+        self._corridors = CorridorView(self.lidar.rays, self.lidar.reach) if corridors else None
+        n_observation = N_STATE + self.lidar.rays + N_VIEW * corridors
         self.observation_space = spaces.Box(-1.0, 1.0, (n_observation,), np.float32)
         self._scenes: OrderedDict[int, Scene] = OrderedDict()
         self._viewer: Any = None
@@ -200,6 +218,8 @@ class SafeDriveEnv(gym.Env):
         self._touched: dict[tuple[str, int], int] = {}  # object -> step of the last contact
         self._tow: dict[int, int] = {}  # parked vehicle that was hit -> step at which it is gone
         self._find_boxes()
+        if self._corridors is not None:
+            self._corridors.reset()
         if self.render_mode == "human":
             self.render()
         return self._observe(), self._info()
@@ -236,16 +256,7 @@ class SafeDriveEnv(gym.Env):
 
     def _locate(self) -> None:
         """Where the ego is on the route, looked for close to where it was (the route may pass near itself)."""
-        route, ego = self.map.route, self.ego
-        first = max(0, int(self.s / SPACING) - 16)
-        d = ego.position - route[first : first + 40, :2]
-        nearest = int(np.argmin(d[:, 0] ** 2 + d[:, 1] ** 2))
-        heading, curvature = route[first + nearest, 2:]
-        x, y = d[nearest]
-        along = float(x * np.cos(heading) + y * np.sin(heading))
-        self.s = (first + nearest) * SPACING + along
-        self.lateral = float(y * np.cos(heading) - x * np.sin(heading))
-        self.heading_error = float(wrap_angle(ego.heading - heading - curvature * along))
+        self.s, self.lateral, self.heading_error = _locate(self.map.route, self.s, self.ego.position, self.ego.heading)
 
     def _find_boxes(self) -> None:
         """Everything that can be hit or seen: first the cars of the traffic that are there, then the obstacles."""
@@ -256,7 +267,12 @@ class SafeDriveEnv(gym.Env):
         self.box_headings = np.concatenate([traffic.headings, scene.obstacle_headings[there]])
         self.box_lengths = np.concatenate([np.full(n_cars, CAR_LENGTH), scene.obstacle_sizes[there, 0]])
         self.box_widths = np.concatenate([np.full(n_cars, CAR_WIDTH), scene.obstacle_sizes[there, 1]])
-        self.box_ids = [("car", int(i)) for i in traffic.visible] + [("obstacle", int(i)) for i in there]
+
+    @property
+    def box_ids(self) -> list[tuple[str, int]]:
+        """Kind ("car" or "obstacle") and index of each box."""
+        obstacles = np.flatnonzero(self.traffic.obstacle_there)
+        return [("car", int(i)) for i in self.traffic.visible] + [("obstacle", int(i)) for i in obstacles]
 
     def _collide(self, before: Pose) -> None:
         """
@@ -273,8 +289,9 @@ class SafeDriveEnv(gym.Env):
         size = ego.LENGTH, ego.WIDTH
         boxes = self.box_positions[near], self.box_headings[near], self.box_lengths[near], self.box_widths[near]
         hits = near[boxes_overlap(ego.position, ego.heading, *size, *boxes)]
+        box_ids = self.box_ids
         for i in hits:
-            kind, index = self.box_ids[i]
+            kind, index = box_ids[i]
             if self.steps - self._touched.get((kind, index), -CONTACT_MEMORY) >= CONTACT_MEMORY:
                 self.collisions += 1
             self._touched[kind, index] = self.steps
@@ -298,24 +315,24 @@ class SafeDriveEnv(gym.Env):
     def _observe(self) -> np.ndarray:
         ego, route = self.ego, self.map.route
         distances, self.seen = self.scan()
-        observation = np.empty(N_EGO + N_NAVIGATION + self.lidar.rays, np.float32)
+        observation = np.empty(self.observation_space.shape, np.float32)
         off_lane = self.lateral - LANES[int(self.lateral > 0)]
         observation[:N_EGO] = (
-            self.lateral / HALF_WIDTH, -self.lateral / HALF_WIDTH, np.tanh(self.heading_error / 0.15),
-            2 * ego.speed / MAX_SPEED - 1, np.tanh(ego.steering / 0.15), *self.last_action,
-            np.tanh(ego.yaw_rate / 0.3), np.tanh(off_lane / 0.5),
+            self.lateral / HALF_WIDTH, -self.lateral / HALF_WIDTH, math.tanh(self.heading_error / 0.15),
+            2 * ego.speed / MAX_SPEED - 1, math.tanh(ego.steering / 0.15), *self.last_action,
+            math.tanh(ego.yaw_rate / 0.3), math.tanh(off_lane / 0.5),
         )  # fmt: skip
         points = route[np.minimum(((self.s + CHECKPOINTS) / SPACING).astype(int), len(route) - 1)]
         d = points[:, :2] - ego.position
         bearing = wrap_angle(np.arctan2(d[:, 1], d[:, 0]) - ego.heading)
-        observation[N_EGO : N_EGO + N_NAVIGATION : 2] = np.tanh(bearing / 0.4)
-        observation[N_EGO + 1 : N_EGO + N_NAVIGATION : 2] = np.tanh(wrap_angle(points[:, 2] - ego.heading) / 0.6)
-        observation[N_EGO + N_NAVIGATION :] = 1 - distances / self.lidar.reach
-        observation = np.clip(observation, -1.0, 1.0)
-        if self._corridors is None:
-            return observation
-        lidar = observation[N_EGO + N_NAVIGATION :]
-        return np.concatenate([observation, self._corridors(lidar, *route_ahead(observation))], dtype=np.float32)
+        observation[N_EGO:N_STATE:2] = np.tanh(bearing / 0.4)
+        observation[N_EGO + 1 : N_STATE : 2] = np.tanh(wrap_angle(points[:, 2] - ego.heading) / 0.6)
+        lidar = observation[N_STATE : N_STATE + self.lidar.rays]
+        lidar[:] = 1 - distances / self.lidar.reach
+        observation[:2] = np.clip(observation[:2], -1.0, 1.0)  # beside the road
+        if self._corridors is not None:
+            observation[N_STATE + self.lidar.rays :] = self._corridors(lidar, *route_ahead(observation))
+        return observation
 
     def scan(self) -> tuple[np.ndarray, np.ndarray]:
         """
@@ -333,7 +350,7 @@ class SafeDriveEnv(gym.Env):
             "out_of_road": self.out_of_road,
             "arrive_dest": self.arrived,
             "is_success": self.arrived,
-            "route_completion": float(np.clip(self.s / (self.map.length - ARRIVES_BEFORE_END), 0.0, 1.0)),
+            "route_completion": min(max(self.s / (self.map.length - ARRIVES_BEFORE_END), 0.0), 1.0),
             "speed": self.ego.speed,
             "episode_cost": float(self.episode_cost),
             "scenario": self.scenario,
@@ -409,8 +426,25 @@ def route_ahead(observation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     :return: [m] points every metre from beside the ego to 50 m ahead, in the ego's frame, shape (51, 2), and [rad] the
         route's headings there, shape (51,)
     """
-    here = -0.15 * np.arctanh(np.clip(observation[2], -0.999999, 0.999999))
-    ahead = 0.6 * np.arctanh(np.clip(observation[N_EGO + 1 : N_EGO + N_NAVIGATION : 2], -0.999999, 0.999999))
-    headings = np.interp(ROUTE, np.concatenate([[0.0], CHECKPOINTS]), np.concatenate([[here], ahead]))
-    lateral = observation[0] * HALF_WIDTH
-    return route_along((np.sin(here) * lateral, -np.cos(here) * lateral), headings), headings
+    tanhs = np.minimum(np.maximum(observation[ROUTE_HEADINGS], -0.999999), 0.999999)
+    headings = np.interp(ROUTE, ROUTE_KNOTS, np.arctanh(tanhs) * ROUTE_HEADING_SCALES)
+    lateral = float(observation[0] * HALF_WIDTH)
+    return route_along(np.sin(headings[0]) * lateral, -np.cos(headings[0]) * lateral, headings), headings
+
+
+@compiled
+def _locate(route: np.ndarray, s: float, position: np.ndarray, heading: float) -> tuple[float, float, float]:
+    """
+    Find where a vehicle is on the route, close to where it was (the route may pass near itself).
+
+    :param s: [m] along the route, where it was
+    :return: s [m], lateral [m] and the heading against that of the route [rad]
+    """
+    first = max(0, int(s / SPACING) - 16)
+    dx, dy = position[0] - route[first : first + 40, 0], position[1] - route[first : first + 40, 1]
+    nearest = np.argmin(dx**2 + dy**2)
+    x, y, there, curvature = dx[nearest], dy[nearest], route[first + nearest, 2], route[first + nearest, 3]
+    along = x * np.cos(there) + y * np.sin(there)
+    lateral = y * np.cos(there) - x * np.sin(there)
+    error = heading - there - curvature * along
+    return (first + nearest) * SPACING + along, lateral, (error + np.pi) % (2 * np.pi) - np.pi

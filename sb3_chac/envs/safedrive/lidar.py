@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from sb3_chac.envs.driving.compiled import compiled
+
 
 class Lidar:
     """
@@ -32,24 +34,33 @@ class Lidar:
         :param positions: centres of the boxes, shape (n, 2), with ``headings``, ``lengths`` and ``widths``, shape (n,)
         :return: [m] distances, ``reach`` where there is nothing, shape (rays,), and indices of the boxes that can be seen
         """
-        d = position - positions
-        near = np.flatnonzero(d[:, 0] ** 2 + d[:, 1] ** 2 < (self.reach + 3.0) ** 2)
-        if len(near) == 0:
-            return np.full(self.rays, self.reach), near
-        d, headings, half_length, half_width = d[near], headings[near], lengths[near, None] / 2, widths[near, None] / 2
-        # Origin and directions of the rays in the frame of each box: (n, 1) and (n, rays)
-        cos, sin = np.cos(headings), np.sin(headings)
-        x = (d[:, 0] * cos + d[:, 1] * sin)[:, None]
-        y = (d[:, 1] * cos - d[:, 0] * sin)[:, None]
-        cos, sin = np.cos(heading - headings)[:, None], np.sin(heading - headings)[:, None]
-        along, across = cos * self.cos - sin * self.sin, sin * self.cos + cos * self.sin
-        per_x = 1 / np.where(np.abs(along) < 1e-9, 1e-9, along)
-        per_y = 1 / np.where(np.abs(across) < 1e-9, 1e-9, across)
-        middle_x, middle_y = -x * per_x, -y * per_y
-        reach_x, reach_y = half_length * np.abs(per_x), half_width * np.abs(per_y)
-        enters = np.maximum(middle_x - reach_x, middle_y - reach_y)
-        leaves = np.minimum(middle_x + reach_x, middle_y + reach_y)
-        hits = (leaves >= enters) & (leaves > 0)
-        distances = np.where(hits, np.maximum(enters, 0.0), np.inf)
-        nearest = distances.min(axis=0, initial=self.reach)
-        return nearest, near[(distances <= nearest).any(axis=1)]
+        return _scan(position, float(heading), positions, headings, lengths, widths, self.cos, self.sin, self.reach)
+
+
+@compiled
+def _scan(position, heading, positions, headings, lengths, widths, ray_cos, ray_sin, reach):
+    nearest = np.full(len(ray_cos), reach)
+    near = np.empty(len(positions), np.int64)
+    distances = np.empty((len(positions), len(ray_cos)))  # of the boxes that are near
+    n = 0
+    for box in range(len(positions)):
+        dx, dy = position[0] - positions[box, 0], position[1] - positions[box, 1]
+        if dx * dx + dy * dy >= (reach + 3.0) ** 2:
+            continue
+        half_length, half_width = lengths[box] / 2, widths[box] / 2
+        # Origin and directions of the rays in the frame of the box
+        cos, sin = np.cos(headings[box]), np.sin(headings[box])
+        x, y = dx * cos + dy * sin, dy * cos - dx * sin
+        cos, sin = np.cos(heading - headings[box]), np.sin(heading - headings[box])
+        for ray in range(len(ray_cos)):
+            along, across = cos * ray_cos[ray] - sin * ray_sin[ray], sin * ray_cos[ray] + cos * ray_sin[ray]
+            per_x = 1 / (along if abs(along) >= 1e-9 else 1e-9)
+            per_y = 1 / (across if abs(across) >= 1e-9 else 1e-9)
+            enters = max(-x * per_x - half_length * abs(per_x), -y * per_y - half_width * abs(per_y))
+            leaves = min(-x * per_x + half_length * abs(per_x), -y * per_y + half_width * abs(per_y))
+            distances[n, ray] = max(enters, 0.0) if leaves >= enters and leaves > 0 else np.inf
+            nearest[ray] = min(nearest[ray], distances[n, ray])
+        near[n] = box
+        n += 1
+    seen = np.array([(distances[i] <= nearest).any() for i in range(n)], np.bool_)
+    return nearest, near[:n][seen]

@@ -2,12 +2,13 @@
 Traffic on rails: every car has a path of its own, a place on it and a speed.
 
 Cars follow whoever is in their way (intelligent driver model, Treiber et al. 2000), let pass who comes first where paths
-cross or merge, and pull over to the other lane before an obstacle. All cars are advanced at once in numpy.
+cross or merge, and pull over to the other lane before an obstacle. The loops over cars are compiled (functions at the end).
 """
 
 import numpy as np
 
-from sb3_chac.envs.safedrive.geometry import SPACING, boxes_overlap, sample, wrap_angle
+from sb3_chac.envs.driving.compiled import compiled
+from sb3_chac.envs.safedrive.geometry import SPACING, boxes_overlap, sample
 from sb3_chac.envs.safedrive.map import LANES, OBSTACLE_SIZES, Map
 
 CAR_LENGTH, CAR_WIDTH = 5.0, 2.0  # [m]
@@ -44,9 +45,11 @@ class Traffic:
             cars.append((table_of[index], s, lane, rng.uniform(*SPEEDS), trigger))
         columns = np.array(cars, dtype=float).reshape(-1, 5).T
         self.initial = (columns[0].astype(int), *columns[1:])
-        self.points = np.concatenate(self.tables)
+        points = np.concatenate(self.tables)
+        self.points = np.column_stack([points, np.cos(points[:, 2]), np.sin(points[:, 2])])
         sizes = np.array([len(table) for table in self.tables])
         self.first, self.last = np.cumsum(sizes) - sizes, sizes - 1
+        self._tables = self.points, self.first, self.last
         obstacles = [(o.s, o.lateral, OBSTACLE_SIZES[o.kind][0] / 2) for o in road_map.obstacles]
         self.obstacle_s, self.obstacle_lateral, self.obstacle_half = np.array(obstacles).reshape(-1, 3).T
         in_use = [road_map.paths[index] for index in table_of]
@@ -96,20 +99,15 @@ class Traffic:
         :param lateral: [m] to the right of it; all broadcast to one shape
         :return: positions, shape (..., 2), and headings, shape (...)
         """
-        index = np.minimum(np.maximum((s / SPACING).astype(int), 0), self.last[path])
-        point = self.points[self.first[path] + index]
-        x, y, heading, curvature = point[..., 0], point[..., 1], point[..., 2], point[..., 3]
-        rest = s - index * SPACING
-        cos, sin = np.cos(heading), np.sin(heading)
-        position = np.empty((*heading.shape, 2))
-        position[..., 0] = x + rest * cos - lateral * sin
-        position[..., 1] = y + rest * sin + lateral * cos
-        return position, heading + curvature * np.minimum(rest, SPACING)
+        path, s, lateral = np.broadcast_arrays(path, s, lateral)
+        positions, headings = _poses(*self._tables, path.ravel(), s.ravel(), lateral.ravel())
+        return positions.reshape(*s.shape, 2), headings.reshape(s.shape)
 
     def update_visible(self) -> None:
         """Where the cars are that one can see: ``visible`` (indices), ``positions`` and ``headings``."""
         self.visible = np.flatnonzero((self.state == DRIVING) | (self.state == CRASHED))
-        self.positions, self.headings = self.poses(self.path[self.visible], self.s[self.visible], self.lateral[self.visible])
+        path, s, lateral = self.path[self.visible], self.s[self.visible], self.lateral[self.visible]
+        self.positions, self.headings = _poses(*self._tables, path, s, lateral)
 
     def crash(self, car: int) -> None:
         """The car stands where it is, and is towed away after some seconds."""
@@ -135,37 +133,43 @@ class Traffic:
         if len(cars) == 0:
             self.update_visible()
             return
-        path, s, lateral, speed = self.path[cars], self.s[cars], self.lateral[cars], self.speed[cars]
+        # Of the cars, then of the ego
+        path, s = np.concatenate([self.path[cars], [0]]), np.concatenate([self.s[cars], [ego_s]])
+        lateral, speed = np.concatenate([self.lateral[cars], [ego_lateral]]), np.concatenate([self.speed[cars], [ego_speed]])
         positions = np.concatenate([self.positions, ego_position[None]])
-        headings = np.append(self.headings, ego_heading)
+        headings = np.concatenate([self.headings, [ego_heading]])
         if self.steps % DECISION_STEPS == 0:
-            everybody = np.append(path, 0), np.append(s, ego_s), np.append(lateral, ego_lateral), np.append(speed, ego_speed)
-            gap = self._pull_over(cars, *everybody)
-            self.acceleration[cars] = self._decide(cars, *everybody, positions, headings, gap)
+            shared = self.shared_from[path] - 12.0, self.shared_to[path], self.ahead_of_route[path]
+            obstacles = self.obstacle_s, self.obstacle_lateral, self.obstacle_half, self.obstacle_there
+            self.target[cars], gaps = _pull_over(self.target[cars], s, lateral, speed, shared, obstacles)
+            waits = self.standing[cars] < PATIENCE
+            self.acceleration[cars] = _decide(
+                self._tables, path, s, lateral, speed, positions, headings, self.desired_speed[cars], waits, gaps
+            )
         self.steps += 1
 
         driving = self.state[cars] == DRIVING
-        new_speed = np.clip(speed + self.acceleration[cars] * dt, 0.0, 15.0) * driving
-        new_s = s + new_speed * dt
-        sideways = np.clip(self.target[cars] - lateral, -LANE_CHANGE_SPEED * dt, LANE_CHANGE_SPEED * dt)
-        new_lateral = lateral + sideways * (new_speed > 0.5)
-        blocked = self._would_hit(path, new_s, new_lateral, positions, headings)
-        if blocked is not None:
-            new_speed[blocked] = 0.0
-            new_s[blocked], new_lateral[blocked] = s[blocked], lateral[blocked]
-        self.speed[cars], self.s[cars], self.lateral[cars] = new_speed, new_s, new_lateral
-        self._take_away(cars, dt)
+        moved = _move(s, lateral, speed, self.target[cars], self.acceleration[cars], driving, dt)
+        for car in self._would_hit(path[:-1], moved[0], moved[1], positions, headings):
+            moved[:, car] = s[car], lateral[car], 0.0
+        self.s[cars], self.lateral[cars], self.speed[cars] = moved
+        self.towed += _take_away(
+            cars, self.path, self.last, self.s, self.speed, self.state, self.standing, self.crashed_for, dt
+        )  # fmt: skip
         self.update_visible()
 
     def _appear(self, ego_s: float, ego_position: np.ndarray) -> None:
         """Cars whose time has come, unless there is somebody in their place."""
-        for car in np.flatnonzero((self.state == HIDDEN) & (self.trigger <= ego_s)):
+        waiting = np.flatnonzero((self.state == HIDDEN) & (self.trigger <= ego_s))
+        if len(waiting) == 0:
+            return
+        places, _ = self.poses(self.path[waiting], self.s[waiting], self.lateral[waiting])
+        for car, place in zip(waiting, places, strict=True):
             if self._stands_on_obstacle(int(car)):
                 self.state[car] = GONE
                 continue
-            position, _ = self.poses(self.path[car], self.s[car], self.lateral[car])
             others = np.concatenate([self.positions, ego_position[None]])
-            if np.min(np.sum((others - position) ** 2, axis=1)) > 15.0**2:
+            if np.min(np.sum((others - place) ** 2, axis=1)) > 15.0**2:
                 self.state[car] = DRIVING
                 self.update_visible()
 
@@ -176,85 +180,17 @@ class Traffic:
         beside = np.abs(self.obstacle_lateral - self.lateral[car]) < 2.5
         return bool((beside & (np.abs(self.obstacle_s - s - self.ahead_of_route[path]) < 12.0)).any())
 
-    def _pull_over(self, cars, path, s, lateral, speed) -> np.ndarray:
-        """
-        Cars on the ego's route pass obstacles in the other lane.
-
-        :param path: of all cars, then of the ego (the other arguments likewise); shape (n_cars + 1,)
-
-        :return: [m] from each car's bumper to an obstacle in its lane, shape (n_cars,)
-        """
-        gap = np.full(len(cars), np.inf)
-        if not self.obstacle_there.any():
-            return gap
-        on_route = (s >= self.shared_from[path] - 12.0) & (s <= self.shared_to[path])
-        s = s + self.ahead_of_route[path]
-        for i in np.flatnonzero(on_route[:-1]):
-            ahead = self.obstacle_s - s[i]
-            near = self.obstacle_there & (ahead > -6.0) & (ahead < 35.0)
-            blocking = near & (np.abs(self.obstacle_lateral - self.target[cars[i]]) < 2.2)
-            if blocking.any():
-                other = -self.target[cars[i]]
-                beside = (
-                    on_route & (np.abs(lateral - other) < 2.5) & (np.abs(s - s[i] + np.maximum(speed - speed[i], 0)) < 10.0)
-                )
-                beside[i] = False
-                if not beside.any() and not (near & (np.abs(self.obstacle_lateral - other) < 2.2)).any():
-                    self.target[cars[i]] = other
-            in_way = near & (ahead > 0) & (np.abs(self.obstacle_lateral - lateral[i]) < 2.3)
-            gap[i] = np.min(np.where(in_way, ahead - CAR_LENGTH / 2 - self.obstacle_half, np.inf))
-        return gap
-
-    def _decide(self, cars, path, s, lateral, speed, positions, headings, obstacle_gap) -> np.ndarray:
-        """
-        :param path: of all cars, then of the ego (the other arguments likewise); shape (n_cars + 1,)
-        :return: [m/s2], shape (n_cars,)
-        """
-        n = len(cars)
-        cos, sin = np.cos(headings), np.sin(headings)
-        # Whose box covers a point of my path, and how far ahead: (n_cars, n_points, n_cars + 1)
-        look = s[:n, None] + CAR_LENGTH / 2 + AHEAD
-        mine, _ = self.poses(path[:n, None], look, lateral[:n, None])
-        d = mine[:, :, None] - positions
-        covered = np.abs(d[..., 0] * cos + d[..., 1] * sin) < CAR_LENGTH / 2 + 0.8
-        covered &= np.abs(d[..., 1] * cos - d[..., 0] * sin) < CAR_WIDTH / 2 + 1.2
-        own = np.arange(n)
-        covered[own, :, own] = False
-        gaps = np.where(covered, AHEAD[:, None], np.inf).min(axis=1)
-        leader = np.argmin(gaps, axis=1)
-        gap = gaps[own, leader] - 1.0
-        their_speed = np.maximum(speed[leader] * np.cos(headings[leader] - headings[:n]), 0.0)
-        their_speed = np.where(obstacle_gap < gap, 0.0, their_speed)
-        gap = np.maximum(np.minimum(gap, obstacle_gap), 0.3)
-        v = speed[:n]
-        wanted = MIN_GAP + v * TIME_GAP + v * (v - their_speed) / (2 * np.sqrt(MAX_ACCELERATION * COMFORTABLE_BRAKING))
-        free = 1 - (v / self.desired_speed[cars]) ** 4
-        acceleration = MAX_ACCELERATION * (free - (np.maximum(wanted, 0.0) / gap) ** 2)
-
-        # Who will be in the same place at the same time, coming from elsewhere: let go first who is farther ahead
-        future, _ = self.poses(path[:, None], s[:, None] + speed[:, None] * SOON, lateral[:, None])
-        distance2 = ((future[:n, None] - future) ** 2).sum(axis=-1).min(axis=-1)
-        crossing = (distance2 < 4.5**2) & (np.abs(wrap_angle(headings[:n, None] - headings)) > 0.25)
-        to = positions - positions[:, None]
-        in_front = to[..., 0] * cos[:, None] + to[..., 1] * sin[:, None]
-        yields = (crossing & (in_front > in_front.T)[:n]).any(axis=1) & (self.standing[cars] < PATIENCE)
-        acceleration = np.where(yields, np.minimum(acceleration, -COMFORTABLE_BRAKING), acceleration)
-        return np.clip(acceleration, -MAX_BRAKING, MAX_ACCELERATION)
-
-    def _would_hit(self, path, s, lateral, positions, headings) -> np.ndarray | None:
+    def _would_hit(self, path, s, lateral, positions, headings) -> np.ndarray:
         """
         :param positions: of the cars before their move, and of the ego
-        :return: cars that must not move, as they would touch another one that they do not touch yet; None if none are near
+        :return: cars that must not move, as they would touch another one that they do not touch yet
         """
         n = len(s)
-        moved, moved_headings = self.poses(path, s, lateral)
+        moved, moved_headings = _poses(*self._tables, path, s, lateral)
         after = np.concatenate([moved, positions[n:]])
-        d = moved[:, None] - after
-        near = d[..., 0] ** 2 + d[..., 1] ** 2 < CAR_LENGTH**2 + CAR_WIDTH**2
-        near[np.arange(n), np.arange(n)] = False
-        if not near.any():
-            return None
-        i, j = np.nonzero(near)
+        i, j = _near(after)
+        if len(i) == 0:
+            return i
         size = CAR_LENGTH, CAR_WIDTH
         touches = np.zeros(len(i), dtype=bool)
         for others, other_headings in ((after, np.append(moved_headings, headings[n:])), (positions, headings)):
@@ -262,12 +198,179 @@ class Traffic:
         before = boxes_overlap(positions[i], headings[i], *size, positions[j], headings[j], *size)
         return np.unique(i[touches & ~before])
 
-    def _take_away(self, cars: np.ndarray, dt: float) -> None:
-        standing = self.speed[cars] < 0.3
-        self.standing[cars] = np.where(standing, self.standing[cars] + dt, np.maximum(self.standing[cars] - 2 * dt, 0.0))
-        crashed = self.state[cars] == CRASHED
-        self.crashed_for[cars] += dt * crashed
-        stuck = (self.standing[cars] > TOWED_AFTER) & ~crashed
-        self.towed += int(stuck.sum())
-        arrived = self.s[cars] >= self.last[self.path[cars]] * SPACING
-        self.state[cars[arrived | stuck | (self.crashed_for[cars] > CRASHED_FOR)]] = GONE
+
+# Loops over cars. Where nothing else is said, arrays hold all n cars that can be seen and then the ego, shape (n + 1,)
+
+
+@compiled
+def _pose(points, first, last, path, s, lateral):
+    """Position (x, y) and heading at a place, ``s`` along and ``lateral`` to the right of a path."""
+    index = min(max(int(s / SPACING), 0), last[path])
+    point = points[first[path] + index]
+    cos, sin = point[4], point[5]
+    rest = s - index * SPACING
+    heading = point[2] + point[3] * min(rest, SPACING)
+    return point[0] + rest * cos - lateral * sin, point[1] + rest * sin + lateral * cos, heading
+
+
+@compiled
+def _poses(points, first, last, path, s, lateral):
+    positions, headings = np.empty((len(s), 2)), np.empty(len(s))
+    for i in range(len(s)):
+        positions[i, 0], positions[i, 1], headings[i] = _pose(points, first, last, path[i], s[i], lateral[i])
+    return positions, headings
+
+
+@compiled
+def _pull_over(target, s, lateral, speed, shared, obstacles):
+    """
+    Cars on the ego's route pass obstacles in the other lane.
+
+    :param target: [m] where the cars want to be, to the right of their path, shape (n,)
+    :param shared: [m] from where to where everybody's path runs on the route, and how far the route is ahead of it
+    :param obstacles: [m] along and beside the route and half of their lengths, and whether they are there
+    :return: the new targets, and [m] from each car's bumper to an obstacle in its lane, shapes (n,)
+    """
+    start, end, ahead_of_route = shared
+    obstacle_s, obstacle_lateral, obstacle_half, obstacle_there = obstacles
+    gaps = np.full(len(target), np.inf)
+    on_route = (s >= start) & (s <= end)
+    s = s + ahead_of_route
+    for car in range(len(target)):
+        if not on_route[car]:
+            continue
+        other = -target[car]
+        blocked = other_blocked = False
+        for obstacle in range(len(obstacle_s)):
+            ahead = obstacle_s[obstacle] - s[car]
+            if not (obstacle_there[obstacle] and -6.0 < ahead < 35.0):
+                continue
+            blocked = blocked or abs(obstacle_lateral[obstacle] - target[car]) < 2.2
+            other_blocked = other_blocked or abs(obstacle_lateral[obstacle] - other) < 2.2
+            if ahead > 0 and abs(obstacle_lateral[obstacle] - lateral[car]) < 2.3:
+                gaps[car] = min(gaps[car], ahead - CAR_LENGTH / 2 - obstacle_half[obstacle])
+        if not blocked or other_blocked:
+            continue
+        beside = on_route & (np.abs(lateral - other) < 2.5)
+        beside &= np.abs(s - s[car] + np.maximum(speed - speed[car], 0.0)) < 10.0
+        beside[car] = False
+        if not beside.any():
+            target[car] = other
+    return target, gaps
+
+
+@compiled
+def _decide(tables, path, s, lateral, speed, positions, headings, desired_speed, waits, obstacle_gaps):
+    """
+    :param tables: arguments of ``_pose``
+    :param desired_speed: [m/s], shape (n,)
+    :param waits: whether a car still lets others pass, shape (n,)
+    :param obstacle_gaps: [m] from a car's bumper to an obstacle in its lane, shape (n,)
+    :return: [m/s2], shape (n,)
+    """
+    points, first, last = tables
+    everybody, n = len(s), len(desired_speed)
+    cos, sin = np.cos(headings), np.sin(headings)
+    future = np.empty((everybody, len(SOON), 2))
+    for i in range(everybody):
+        for k in range(len(SOON)):
+            future[i, k, 0], future[i, k, 1], _ = _pose(points, first, last, path[i], s[i] + speed[i] * SOON[k], lateral[i])
+    acceleration = np.empty(n)
+    for i in range(n):
+        leader, gap = _leader(i, tables, path, s, lateral, positions, cos, sin)
+        v, their_speed = speed[i], max(speed[leader] * np.cos(headings[leader] - headings[i]), 0.0)
+        if obstacle_gaps[i] < gap:
+            gap, their_speed = obstacle_gaps[i], 0.0
+        wanted = MIN_GAP + v * TIME_GAP + v * (v - their_speed) / (2 * np.sqrt(MAX_ACCELERATION * COMFORTABLE_BRAKING))
+        free = 1 - (v / desired_speed[i]) ** 4
+        acceleration[i] = MAX_ACCELERATION * (free - (max(wanted, 0.0) / max(gap, 0.3)) ** 2)
+        if waits[i] and _yields(i, positions, headings, cos, sin, future):
+            acceleration[i] = min(acceleration[i], -COMFORTABLE_BRAKING)
+    return np.clip(acceleration, -MAX_BRAKING, MAX_ACCELERATION)
+
+
+@compiled
+def _leader(i, tables, path, s, lateral, positions, cos, sin):
+    """
+    Whose box covers a point of car i's path, and how far ahead.
+
+    :return: index and [m]; 0 and inf if there is nobody
+    """
+    points, first, last = tables
+    for ahead in AHEAD:
+        x, y, _ = _pose(points, first, last, path[i], s[i] + CAR_LENGTH / 2 + ahead, lateral[i])
+        for j in range(len(positions)):
+            dx, dy = x - positions[j, 0], y - positions[j, 1]
+            along, across = abs(dx * cos[j] + dy * sin[j]), abs(dy * cos[j] - dx * sin[j])
+            if j != i and along < CAR_LENGTH / 2 + 0.8 and across < CAR_WIDTH / 2 + 1.2:
+                return j, ahead - 1.0
+    return 0, np.inf
+
+
+@compiled
+def _yields(i, positions, headings, cos, sin, future):
+    """
+    Who will be in the same place at the same time, coming from elsewhere: let go first who is farther ahead.
+
+    :param future: positions at the times ``SOON``, shape (n + 1, len(SOON), 2)
+    :return: whether car i lets anybody go first
+    """
+    for j in range(len(positions)):
+        angle = (headings[i] - headings[j] + np.pi) % (2 * np.pi) - np.pi
+        dx, dy = positions[j, 0] - positions[i, 0], positions[j, 1] - positions[i, 1]
+        if abs(angle) <= 0.25 or dx * cos[i] + dy * sin[i] <= -dx * cos[j] - dy * sin[j]:
+            continue
+        for k in range(len(SOON)):
+            if (future[i, k, 0] - future[j, k, 0]) ** 2 + (future[i, k, 1] - future[j, k, 1]) ** 2 < 4.5**2:
+                return True
+    return False
+
+
+@compiled
+def _move(s, lateral, speed, target, acceleration, driving, dt):
+    """
+    :return: new s [m], lateral [m] and speed [m/s] of the cars, shape (3, n)
+    """
+    moved = np.empty((3, len(target)))
+    for i in range(len(target)):
+        new_speed = min(max(speed[i] + acceleration[i] * dt, 0.0), 15.0) if driving[i] else 0.0
+        sideways = min(max(target[i] - lateral[i], -LANE_CHANGE_SPEED * dt), LANE_CHANGE_SPEED * dt)
+        moved[0, i] = s[i] + new_speed * dt
+        moved[1, i] = lateral[i] + sideways * (new_speed > 0.5)
+        moved[2, i] = new_speed
+    return moved
+
+
+@compiled
+def _near(positions):
+    """
+    :param positions: of the cars, then of the ego
+    :return: the cars, and all others so near to them that they may touch, two arrays of indices
+    """
+    pairs = [
+        (i, j)
+        for i in range(len(positions) - 1)
+        for j in range(len(positions))
+        if i != j
+        and (positions[i, 0] - positions[j, 0]) ** 2 + (positions[i, 1] - positions[j, 1]) ** 2 < CAR_LENGTH**2 + CAR_WIDTH**2
+    ]
+    return np.array([pair[0] for pair in pairs], np.int64), np.array([pair[1] for pair in pairs], np.int64)
+
+
+@compiled
+def _take_away(cars, path, last, s, speed, state, standing, crashed_for, dt):
+    """
+    Remove who has arrived, has crashed or stands for too long; arrays hold all cars of the map, and are changed.
+
+    :return: how many stood for too long
+    """
+    towed = 0
+    for car in cars:
+        standing[car] = standing[car] + dt if speed[car] < 0.3 else max(standing[car] - 2 * dt, 0.0)
+        crashed = state[car] == CRASHED
+        crashed_for[car] += dt * crashed
+        stuck = standing[car] > TOWED_AFTER and not crashed
+        towed += stuck
+        if stuck or s[car] >= last[path[car]] * SPACING or crashed_for[car] > CRASHED_FOR:
+            state[car] = GONE
+    return towed
