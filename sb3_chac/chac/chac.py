@@ -269,8 +269,7 @@ class CHAC(DPVP):
         self._show_stage()
 
     def _show_stage(self) -> None:
-        if self.env is not None and self.env.has_attr("set_stage"):
-            self.env.env_method("set_stage", self.stage)
+        self._ask_wrappers(self._wrapped, "set_stage", self.stage)
 
     def _optimizers(self) -> list[th.optim.Optimizer]:
         return [*super()._optimizers(), self.confidence_critic.optimizer, self.self_actor.optimizer]

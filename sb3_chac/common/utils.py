@@ -3,8 +3,11 @@
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 
+import numpy as np
 import torch as th
+from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.utils import get_parameters_by_name
+from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 
 from sb3_chac.common.checks import check_range
@@ -66,6 +69,30 @@ def frozen(params: Iterable[th.Tensor]) -> Iterator[None]:
     finally:
         for param in params:
             param.requires_grad_(True)
+
+
+class FixedStatistics(RunningMeanStd):
+    """
+    Statistics of what a model is fitted to. They stand still: an environment that is stepped does not move them away.
+
+    :param values: shape (n, ...)
+    """
+
+    def __init__(self, values: np.ndarray):
+        super().__init__(shape=values.shape[1:])
+        super().update(values)
+
+    def update(self, arr: np.ndarray) -> None:
+        pass
+
+
+def fix_statistics(normalize: VecNormalize | None, observations: np.ndarray) -> None:
+    """
+    :param normalize: of an environment; if it is in training, it normalizes by the statistics of ``observations`` from now on
+    :param observations: that a model is about to be fitted to, not normalized, shape (n, *observation_shape)
+    """
+    if normalize is not None and normalize.training and normalize.norm_obs:
+        normalize.obs_rms = FixedStatistics(observations)
 
 
 def initial_ent_coef(ent_coef: str | float) -> float:

@@ -9,6 +9,7 @@ from gymnasium import spaces
 from highway_env.road.road import Road
 
 from sb3_chac.common.checks import check_integer, check_range
+from sb3_chac.common.contract import TakeoverDisplay
 from sb3_chac.envs.display import STEPS_PER_SECOND
 from sb3_chac.envs.driving.corridors import N_CORRIDORS, ROUTE_SPACING, Corridors
 from sb3_chac.envs.safedrive.driver import IMPERFECTIONS, ScriptedDriver
@@ -39,7 +40,7 @@ class Scene(NamedTuple):
     obstacle_sizes: np.ndarray  # length and width
 
 
-class SafeDriveEnv(gym.Env):
+class SafeDriveEnv(gym.Env, TakeoverDisplay):
     """
     Drive a route through seeded maps of straights, curves, ramps, roundabouts, T-intersections and intersections, among
     traffic, cones, warning triangles and parked vehicles; ten decisions per second.
