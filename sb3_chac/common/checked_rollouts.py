@@ -8,6 +8,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
 from sb3_chac.common.checks import check_finite, check_step
+from sb3_chac.common.utils import detach_distributions
 
 
 class CheckedVecEnv(VecEnvWrapper):
@@ -48,6 +49,10 @@ class CheckedRollouts(OnPolicyAlgorithm):
         prepared = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
         check_finite("observation", self._last_obs, self.num_timesteps)  # type: ignore[arg-type]
         return prepared
+
+    def train(self) -> None:
+        super().train()
+        detach_distributions(self.policy)
 
     def collect_rollouts(
         self, env: VecEnv, callback: BaseCallback, rollout_buffer: RolloutBuffer, n_rollout_steps: int

@@ -5,6 +5,7 @@ from contextlib import contextmanager
 
 import numpy as np
 import torch as th
+from stable_baselines3.common.distributions import Distribution
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.utils import get_parameters_by_name
 from stable_baselines3.common.vec_env import VecNormalize
@@ -93,6 +94,21 @@ def fix_statistics(normalize: VecNormalize | None, observations: np.ndarray) -> 
     """
     if normalize is not None and normalize.training and normalize.norm_obs:
         normalize.obs_rms = FixedStatistics(observations)
+
+
+def detach_distributions(policy: nn.Module) -> None:
+    """
+    Cut what the action distributions of a policy remember of the last batch off its graph, which would keep the policy from
+    being copied (``copy.deepcopy``) and traced.
+    """
+    distributions = [module.action_dist for module in policy.modules() if hasattr(module, "action_dist")]
+    for distribution in distributions:
+        # Itself, and the torch distributions that it holds
+        for holder in (distribution, *vars(distribution).values()):
+            if isinstance(holder, Distribution | th.distributions.Distribution):
+                for name, value in vars(holder).items():
+                    if isinstance(value, th.Tensor) and value.grad_fn is not None:
+                        setattr(holder, name, value.detach())
 
 
 def initial_ent_coef(ent_coef: str | float) -> float:

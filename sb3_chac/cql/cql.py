@@ -11,7 +11,7 @@ from stable_baselines3.sac.policies import Actor
 
 from sb3_chac.common.checks import check_action_space, check_integer, check_learning_rate, check_range
 from sb3_chac.common.offline import Batch, OfflineAlgorithm
-from sb3_chac.common.utils import TargetUpdate, frozen, initial_ent_coef, minimize
+from sb3_chac.common.utils import TargetUpdate, detach_distributions, frozen, initial_ent_coef, minimize
 from sb3_chac.cql.policies import CnnPolicy, CQLPolicy, MlpPolicy
 from sb3_chac.human.demonstrations import Dataset
 
@@ -189,6 +189,7 @@ class CQL(OfflineAlgorithm):
         ent_coef = self.policy.log_ent_coef.detach().exp()
         stats = self._update_critic(batch, ent_coef) | self._update_actor(batch, ent_coef)
         self.target_update(self.tau)
+        detach_distributions(self.policy)
         return stats
 
     def _update_critic(self, batch: Batch, ent_coef: th.Tensor) -> dict[str, th.Tensor]:

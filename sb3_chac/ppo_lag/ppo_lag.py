@@ -16,6 +16,7 @@ from torch.nn import functional as F
 from sb3_chac.common.checked_rollouts import CheckedRollouts
 from sb3_chac.common.checks import check_learning_rate, check_range
 from sb3_chac.common.lagrange import CostConstrainedAlgorithm, constrained_advantages
+from sb3_chac.common.utils import detach_distributions
 from sb3_chac.ppo_lag.buffers import CostDictRolloutBuffer, CostRolloutBuffer, CostRolloutBufferSamples
 from sb3_chac.ppo_lag.policies import CnnPolicy, CostActorCriticPolicy, MlpPolicy, MultiInputPolicy
 
@@ -265,6 +266,7 @@ class PPOLag(CostConstrainedAlgorithm, CheckedRollouts, PPO):
             self._n_updates += 1
             if not continue_training:
                 break
+        detach_distributions(self.policy)
 
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         self._record_multiplier()
