@@ -28,9 +28,14 @@ USE_ONEDNN = th.backends.mkldnn.is_available() and hasattr(th.ops.mkldnn, "_line
 MIN_BATCH_SIZE = 32
 
 
+def is_traced() -> bool:
+    """Whether torch records what is computed (TorchScript, ONNX, ``torch.export``), to run it elsewhere."""
+    return th.jit.is_tracing() or th.compiler.is_compiling()
+
+
 def uses_onednn() -> bool:
-    """Whether to take the detour: not while a policy is traced or exported, it is to run elsewhere."""
-    return USE_ONEDNN and not th.jit.is_tracing() and not th.compiler.is_compiling()
+    """Whether to take the detour."""
+    return USE_ONEDNN and not is_traced()
 
 
 class OneDnnLinearFunction(th.autograd.Function):
