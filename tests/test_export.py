@@ -16,13 +16,13 @@ OBSERVATIONS = np.random.default_rng(0).uniform(-3, 3, (40, 2)).astype(np.float3
 
 # C-HAC acts otherwise in each stage
 CASES = [(name, {}) for name in ALL if name != "CHAC"]
-CASES += [
-    ("CHAC", {"switch_after": after, "delta": 0.5, "shared_control": shared})
-    for after, shared in ((999, True), (20, True), (20, False))
-]
-each_case = pytest.mark.parametrize(
-    "name, kwargs", CASES, ids=[name for name, _ in CASES[:-3]] + ["CHAC 1", "CHAC 2", "CHAC 2 self"]
-)
+STAGES = {
+    "CHAC 1": {"switch_after": 999},
+    "CHAC 2": {"switch_after": 20, "delta": 0.5},
+    "CHAC 2, self": {"switch_after": 20, "shared_control": False},
+}
+CASES += [("CHAC", kwargs) for kwargs in STAGES.values()]
+each_case = pytest.mark.parametrize("name, kwargs", CASES, ids=[name for name in ALL if name != "CHAC"] + list(STAGES))
 
 
 class Deterministic(th.nn.Module):
@@ -104,7 +104,7 @@ def test_onnx(name, kwargs, dynamo, tmp_path):
 
 def test_the_stage_travels():
     """A policy that was exported in stage 1 and one in stage 2 differ, and the shared one is neither of the two alone."""
-    model, shared = trained("CHAC", CASES[-2][1])
+    model, shared = trained("CHAC", STAGES["CHAC 2"])
     assert isinstance(model, sb3_chac.CHAC)
     acts = [model.predict(OBSERVATIONS, deterministic=True, policy=policy)[0] for policy in ("guided", "self")]
     assert not np.allclose(acts[0], acts[1])
