@@ -368,15 +368,14 @@ def _check_arrays(demonstrations: Demonstrations, name: str) -> None:
         assert isinstance(action_space, spaces.Box)
         low, high = action_space.low.astype(float), action_space.high.astype(float)
     tolerance = np.nan_to_num(1e-6 * (high - low), posinf=0.0)  # for rounding
-    for field in ("actions", "novice_actions"):
-        values = getattr(demonstrations, field)
+    for whose, values in (("", demonstrations.actions), ("novice's ", demonstrations.novice_actions)):
         if values is None:
             continue
         outside = ((values < low - tolerance) | (values > high + tolerance)).reshape(steps, -1).any(axis=1)
         if outside.any():
             step = int(np.argmax(outside))
             raise DatasetError(
-                f"{name}: the action of step {step} is out of bounds, {values[step]} of its {field} is not in {action_space}. "
+                f"{name}: the {whose}action of step {step} is out of bounds, {values[step]} is not in {action_space}. "
                 "Record what the environment executes: clip the actions before they are recorded."
             )
 
