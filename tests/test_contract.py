@@ -7,7 +7,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from guided_toys import ALGORITHMS, Limited, column, make_guided, scripted, wrapper
+from guided_toys import ALGORITHMS, Limited, column, make_guided, scripted
 from gymnasium import spaces
 from gymnasium.wrappers import ClipAction, RescaleAction, TransformAction
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
@@ -89,9 +89,10 @@ def test_each_algorithm_refuses_them(algorithm):
 
 @each_algorithm
 def test_below_the_takeover_actions_may_be_changed(algorithm):
-    model = make(algorithm, takeover(Stepping(Halving(rescaled(Limited())))))
-    model.learn(5)
-    assert np.allclose(column(model.replay_buffer.human, "action"), 2 * EXPERT - 1)
+    human_action = np.array([0.75, 0.25])  # in [0, 1]
+    env = InterventionWrapper(Stepping(Halving(rescaled(Limited()))), lambda observation: human_action, "always")
+    model = make(algorithm, env).learn(5)
+    assert np.allclose(column(model.replay_buffer.human, "action"), [0.5, -0.5])
 
 
 # --- Takeovers that environments report
@@ -147,7 +148,7 @@ def test_reported_takeovers_count_exactly(report, wrap):
     executed = np.array(env.unwrapped.executed)[[2, 3, 6, 7, 8][: 4 + extra]]
     assert np.allclose(column(human, "action"), executed) and np.allclose(executed[:4], EXPERT)
     if wrap != "alone":
-        assert wrapper(model).human_steps == 4 + extra
+        assert env.human_steps == 4 + extra
 
 
 @each_algorithm
