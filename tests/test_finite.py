@@ -21,7 +21,7 @@ SOURCES = {
 }
 OF_TAKEOVERS = {key: rf"info\['{key}'\] of environment 0" for key in ("intervene_action", "applied_action", "takeover_cost")}
 IN_DATASETS = ("observations", "next_observations", "actions", "rewards", "costs", "novice_actions")
-VALUES = {"nan": np.nan, "inf": np.inf, "-inf": -np.inf, "too large": 1e39}
+VALUES = {"nan": np.nan, "inf": np.inf, "too large": -1e39}
 BREAKS_AT = 18  # the end of an episode: of its third
 
 

@@ -227,6 +227,7 @@ class HGDagger(GuidedOffPolicyAlgorithm):
             self._end_round()
         elif self.num_timesteps >= self._total_timesteps:
             self._fit()
+        if self.num_timesteps >= self._total_timesteps:
             evaluate_now(self._callback)
 
     def _fit(self) -> None:
@@ -236,6 +237,8 @@ class HGDagger(GuidedOffPolicyAlgorithm):
         if n == 0:
             return
         fix_statistics(self._vec_normalize_env, observations)
+        if self._vec_normalize_env is not None and self._last_original_obs is not None:
+            self._last_obs = self._vec_normalize_env.normalize_obs(self._last_original_obs)  # type: ignore[assignment]
         # Switch to train mode (this affects batch norm / dropout)
         self.policy.set_training_mode(True)
         self._update_learning_rate(self.policy.optimizer)
