@@ -20,7 +20,11 @@ if TYPE_CHECKING:
 
 # What ``load_demonstrations`` takes
 Dataset: TypeAlias = Union[
-    str, os.PathLike[str], "Demonstrations", "MinariDataset", Sequence[Union[str, os.PathLike[str], "MinariDataset"]]
+    str,
+    os.PathLike[str],
+    "Demonstrations",
+    "MinariDataset",
+    Sequence[Union[str, os.PathLike[str], "Demonstrations", "MinariDataset"]],
 ]
 HOW_TO_GET_ONE = (
     "Record one with 'python -m sb3_chac demos record', fetch one with 'minari download', or list those that are there with "

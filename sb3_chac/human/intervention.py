@@ -175,7 +175,7 @@ class InterventionWrapper(contract.TakeoverWrapper, RecordConstructorArgs):
         """Ends a takeover and a pause; from the next step on the wrapper is inert. The counts are kept."""
         self._on("hand back")
         self._on("resume")
-        self._armed = self._has_to_start = False
+        self._armed = self._has_to_start = self._is_granted = False
 
     def set_rule(self, rule: Any = None) -> None:
         """
