@@ -7,6 +7,7 @@ from collections import deque
 from typing import Any, TypeVar
 
 import numpy as np
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
@@ -16,7 +17,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from sb3_chac.common import contract
 from sb3_chac.common.buffers import DualReplayBuffer
-from sb3_chac.common.checks import check_finite, number_in
+from sb3_chac.common.checks import check_action_space, check_finite, number_in
 from sb3_chac.common.off_policy_algorithm import CheckedOffPolicyAlgorithm
 from sb3_chac.human.demonstrations import Dataset, load_demonstrations
 
@@ -110,8 +111,9 @@ class GuidedOffPolicyAlgorithm(CheckedOffPolicyAlgorithm):
 
     @staticmethod
     def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
-        wrapped = CheckedOffPolicyAlgorithm._wrap_env(env, verbose, monitor_wrapper)
+        wrapped = BaseAlgorithm._wrap_env(env, verbose, monitor_wrapper)
         contract.check_order(wrapped)
+        check_action_space(wrapped.action_space)
         return wrapped
 
     def _forget_episodes(self) -> None:
