@@ -90,7 +90,7 @@ def _truth(value: Any) -> bool:
 def scaled(action: np.ndarray, action_space: spaces.Space, env_idx: int) -> np.ndarray:
     """
     :param action: the human's, in the units of ``action_space``, a Box with finite bounds
-    :return: scaled to [-1, 1], flat
+    :return: scaled to [-1, 1], of the same shape
     :raises ValueError: if it is outside of the bounds
     """
     assert isinstance(action_space, spaces.Box)
@@ -101,7 +101,7 @@ def scaled(action: np.ndarray, action_space: spaces.Space, env_idx: int) -> np.n
             f"The human's action of environment {env_idx} is out of bounds, {action} is not in {action_space}: clip it, or "
             "report it in the units of the outermost action space. Nothing of this step was stored."
         )
-    return np.clip(values, -1, 1).ravel()
+    return np.clip(values, -1, 1)
 
 
 def changed_action(env_idx: int, sent: np.ndarray, received: np.ndarray) -> ValueError:
