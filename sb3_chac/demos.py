@@ -153,8 +153,9 @@ def find_model(path: Path, env_id: str, env_kwargs: dict[str, Any]) -> tuple[Bas
     path, algo, algorithm = find_algorithm(path, None)
     env = make_env(env_id, env_kwargs)
     model = load_model(path, algo, algorithm, env)
+    normalize = find_normalization(path, env_id, env)[1]
     env.close()
-    return model, find_normalization(path, env_id)[1]
+    return model, normalize
 
 
 def run_info(args: argparse.Namespace) -> None:

@@ -295,8 +295,7 @@ class CHAC(DPVP):
         self._show_stage()
 
     def _show_stage(self) -> None:
-        if self.env is not None and self.env.has_attr("set_stage"):
-            self.env.env_method("set_stage", self.stage)
+        self._ask_wrappers(self._wrapped, "set_stage", self.stage)
 
     def _optimizers(self) -> list[th.optim.Optimizer]:
         return [*super()._optimizers(), self.confidence_critic.optimizer, self.self_actor.optimizer]
@@ -342,9 +341,11 @@ class CHAC(DPVP):
             penalty = self.cost_coef * self.takeover_cost
             q_novice, std_novice = self.confidence_critic(take_rows(batch.observations, human), batch.novice_actions[human])
             differ = (batch.actions - batch.novice_actions)[human].square().mean(dim=1).sqrt() >= self.pv_min_diff
-            shifted = (t[human] - penalty for t in targets)
+            mean_targets, sampled_targets = (target[human] - penalty for target in targets)
             eta = self.eta if self.eta_c is None else self.eta_c
-            labels = gaussian_surrogate_loss(q_novice, std_novice, *shifted, self.confidence_critic.mean_std, eta)
+            labels = gaussian_surrogate_loss(
+                q_novice, std_novice, mean_targets, sampled_targets, self.confidence_critic.mean_std, eta
+            )
             loss = loss + (labels * differ).sum() / len(batch.takeovers)
         minimize(loss, self.confidence_critic.optimizer)
         self.confidence_update(self.tau if self.tau_c is None else self.tau_c)

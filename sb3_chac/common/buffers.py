@@ -12,6 +12,7 @@ from stable_baselines3.common.type_aliases import TensorDict
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_chac.common.checks import check_integer, check_range
+from sb3_chac.common.contract import NOVICE_ACTION, TAKEOVER, TAKEOVER_START
 
 Observation = np.ndarray | dict[str, np.ndarray]
 # Columns of a store with one number a row
@@ -196,12 +197,12 @@ class DualReplayBuffer(ReplayBuffer):
                 **self._entries("observation", obs, idx),
                 **self._entries("next_observation", next_obs, idx),
                 "action": np.ravel(action[idx]),
-                "novice_action": np.ravel(info.get("novice_action", action[idx])),
+                "novice_action": np.ravel(info.get(NOVICE_ACTION, action[idx])),
                 "reward": reward[idx],
                 "discount": self.gamma,
                 "done": done[idx] and not is_timeout,
-                "takeover": bool(info.get("takeover", False)),
-                "takeover_start": bool(info.get("takeover_start", False)),
+                "takeover": bool(info.get(TAKEOVER, False)),
+                "takeover_start": bool(info.get(TAKEOVER_START, False)),
                 "cost": float(info.get("cost", 0.0)),
             }
             if self.n_steps == 1:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 
 FOLDER = "checkpoints"  # of a run
@@ -58,6 +59,7 @@ class ResumableCheckpoint(BaseCallback):
         final = self.folder / str(self.tried_at)
         if final.exists():
             return
+        check_finite_model(self.model)
         temporary = self.folder / f"{self.tried_at}.tmp"
         try:
             self._write(temporary)
@@ -95,6 +97,18 @@ class ResumableCheckpoint(BaseCallback):
             normalize.save(str(folder / self.env_name / "vecnormalize.pkl"))
         for path in [*folder.rglob("*"), folder]:
             sync(path)
+
+
+def check_finite_model(model: BaseAlgorithm) -> None:
+    """
+    :raises ValueError: if a parameter is NaN or infinite; names it
+    """
+    for name, values in model.policy.state_dict().items():
+        if not values.isfinite().all():
+            raise ValueError(
+                f"model: {name} is NaN or infinite at step {model.num_timesteps}: no checkpoint was written, the older one is "
+                "kept. Look for values that are too large in observations, rewards and costs, or lower the learning rate."
+            )
 
 
 class SparseWriter(io.BufferedWriter):

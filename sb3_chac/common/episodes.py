@@ -1,5 +1,6 @@
 """One evaluation episode at a time: what acts, in which environment, and the record of it."""
 
+import copy
 import io
 import math
 from collections.abc import Callable
@@ -184,8 +185,9 @@ class Runner:
         terminated = truncated = False
         on_step()
         while not (terminated or truncated):
-            actions.append(self.driver(observation))
-            observation, reward, terminated, truncated, info = self.env.step(actions[-1])
+            action = self.driver(observation)
+            actions.append(copy.deepcopy(action))  # the environment may change what it is given
+            observation, reward, terminated, truncated, info = self.env.step(action)
             rewards.append(float(reward))
             costs.append(float(info.get("cost", 0.0)))
             positions.append(self._position())

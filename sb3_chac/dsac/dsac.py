@@ -15,7 +15,7 @@ from sb3_chac.common.checks import check_integer, check_learning_rate, check_ran
 from sb3_chac.common.critics import DistributionalCritic
 from sb3_chac.common.distributional import gaussian_nll, gaussian_surrogate_loss, return_targets
 from sb3_chac.common.off_policy_algorithm import CheckedOffPolicyAlgorithm
-from sb3_chac.common.utils import TargetUpdate, frozen, initial_ent_coef, minimize
+from sb3_chac.common.utils import TargetUpdate, detach_distributions, frozen, initial_ent_coef, minimize
 from sb3_chac.dsac.policies import CnnPolicy, DSACPolicy, MlpPolicy, MultiInputPolicy
 
 SelfDSAC = TypeVar("SelfDSAC", bound="DSAC")
@@ -240,6 +240,7 @@ class DSAC(CheckedOffPolicyAlgorithm):
                 self.policy.reset_noise()
             for name, value in self._gradient_step(self._sample_batch(batch_size)).items():
                 stats[name].append(value)
+        detach_distributions(self.policy)
 
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         for name, values in stats.items():

@@ -15,7 +15,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from sb3_chac.common.checks import check_integer
 from sb3_chac.common.lagrange import CostConstrainedAlgorithm, constrained_actor_loss
 from sb3_chac.common.off_policy_algorithm import CheckedOffPolicyAlgorithm
-from sb3_chac.common.utils import TargetUpdate, frozen, minimize
+from sb3_chac.common.utils import TargetUpdate, detach_distributions, frozen, minimize
 from sb3_chac.sac_lag.buffers import CostNStepReplayBuffer, CostReplayBuffer, CostReplayBufferSamples, default_buffer_class
 from sb3_chac.sac_lag.policies import CnnPolicy, MlpPolicy, MultiInputPolicy, SACLagPolicy
 
@@ -275,6 +275,7 @@ class SACLag(CostConstrainedAlgorithm, CheckedOffPolicyAlgorithm, SAC):
             means = {"q_mean": q_values.mean(), "cost_q_mean": cost_q_values.mean(), "ent_coef": ent_coef.squeeze()}
             for name, value in (losses | means | {"actor_loss": actor_loss}).items():
                 stats[name].append(value.detach())
+        detach_distributions(self.policy)
 
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         self._record_multiplier()

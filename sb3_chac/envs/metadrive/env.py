@@ -8,6 +8,7 @@ import numpy as np
 from gymnasium import spaces
 
 from sb3_chac.common.checks import check_integer, check_range
+from sb3_chac.common.contract import TakeoverDisplay
 from sb3_chac.envs.display import STEPS_PER_SECOND
 from sb3_chac.envs.driving.corridors import FAR, LATERALS, N_CORRIDORS, N_VIEW, ROUTE_SPACING, CorridorView, route_along
 from sb3_chac.envs.metadrive.drivers import DRIVERS
@@ -53,7 +54,7 @@ PRESETS = {
 }
 
 
-class MetaDriveSafetyEnv(gym.Env):
+class MetaDriveSafetyEnv(gym.Env, TakeoverDisplay):
     """
     MetaDrive's SafeMetaDriveEnv: drive through seeded maps of three blocks among traffic, cones, warning triangles, barriers
     and broken-down vehicles; ten decisions per second. One environment per process (see ``EngineInUse``).
