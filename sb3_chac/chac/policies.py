@@ -93,7 +93,7 @@ class CHACPolicy(DPVPPolicy):
         scaled = self.sigma_scale * std_self, self.sigma_scale * std_guided
         confidence = probability_of_improvement(q_self, scaled[0], q_guided, scaled[1])
         # For delta 1 also where the confidence is too small for a float
-        self_drives = (confidence > 1 - self.delta) | (self.delta == 1)
+        self_drives = confidence > 1 - self.delta if self.delta < 1 else th.ones_like(confidence, dtype=th.bool)
         actions = th.where(self_drives.unsqueeze(1), self_actions, guided_actions)
         return Choice(actions, self_drives, confidence, q_self, q_guided, std_self, std_guided)
 
