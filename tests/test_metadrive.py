@@ -8,6 +8,7 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.utils.env_checker import check_env
 from shell import run
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 from stable_baselines3.common.env_util import make_vec_env
@@ -59,12 +60,12 @@ def parked_vehicle(env):
 
 @needs_metadrive
 def test_checkers_of_gymnasium_and_sb3():
-    # gymnasium's check_env wants rewards to repeat to the last bit, MetaDrive's repeat to 1e-6
     env = gym.make("MetaDriveSafety-v0")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             sb3_check_env(env)
+            check_env(env.unwrapped, skip_render_check=True, skip_close_check=True)  # closing: below
     finally:
         env.close()
 
@@ -126,18 +127,41 @@ def test_scenarios_are_drawn_from_their_range_and_can_be_named(env):
             env.reset(options={"scenario": wrong})
 
 
+def wild_drive(env, scenario, steps=130):
+    """Observations, rewards and ends."""
+    observation, _ = env.reset(options={"scenario": scenario})
+    rows, rng = [observation], np.random.default_rng(0)
+    for action in np.clip(rng.normal((0.0, 0.4), 0.2, (steps, 2)), -1, 1):
+        observation, *rest, _ = env.step(action)
+        rows.append(np.append(observation, rest))
+    return np.concatenate(rows)
+
+
+def crash(env, scenario):
+    """The same, of running into a vehicle that stands, and on."""
+    env.reset(options={"scenario": scenario})
+    things = env.simulator.engine.get_objects().values()
+    place(env, next(thing for thing in things if getattr(thing, "break_down", False)), gap=6.5, speed=5.0)
+    rows = []
+    for action in [(0.0, 0.5)] * 30 + [(0.5, 1.0)] * 30:
+        observation, *rest, info = env.step(np.array(action))
+        rows.append(np.append(observation, rest))
+    assert info["episode_cost"] > 0
+    return np.concatenate(rows)
+
+
 @needs_metadrive
-def test_same_scenario_and_actions_give_the_same_episode(env):
-    rng = np.random.default_rng(0)
-    actions = np.clip(rng.normal((0.0, 0.4), 0.2, (80, 2)), -1, 1)
-
-    def rewards():
-        env.reset(options={"scenario": 3005})
-        return [env.step(action)[1] for action in actions]
-
-    first = rewards()
-    env.reset(options={"scenario": 3006})
-    assert np.allclose(first, rewards(), atol=1e-5)
+@pytest.mark.parametrize("drive", [wild_drive, crash])
+def test_an_episode_repeats_to_the_digit_whatever_came_before(env, drive):
+    scenario = 1006
+    if drive is crash:
+        parked_vehicle(env)
+        scenario = env.scenario
+    first = drive(env, scenario)
+    for before in (lambda: None, lambda: wild_drive(env, 1003, 300), lambda: crash(env, env.scenario)):
+        parked_vehicle(env)
+        before()
+        np.testing.assert_array_equal(drive(env, scenario), first)
 
 
 @pytest.mark.parametrize(

@@ -185,6 +185,7 @@ class MetaDriveSafetyEnv(gym.Env, TakeoverDisplay):
                 accident_prob=0.8,
                 out_of_route_done=True,
                 horizon=self.horizon,
+                force_destroy=True,  # vehicles that are used again keep something, and episodes would depend on those before
                 agent_configs={"default_agent": {**SPAWN, "max_speed_km_h": float(settings.max_speed)}},
             ),
         )
