@@ -6,14 +6,13 @@ import signal
 import subprocess
 import sys
 import sysconfig
-import time
 import warnings
 import zipfile
 from pathlib import Path
 
 import numpy as np
 import pytest
-from shell import clean_environment, run
+from shell import clean_environment, run, wait_until
 from stable_baselines3.common.callbacks import ConvertCallback
 from stable_baselines3.common.save_util import load_from_pkl
 
@@ -66,12 +65,12 @@ def kill_after_checkpoint(step: int, run_folder: Path, *command: str | Path, cwd
         process = subprocess.Popen(
             list(map(str, command)), cwd=cwd, env=clean_environment(), stdout=output, stderr=subprocess.STDOUT
         )
-        deadline = time.monotonic() + 300
-        while process.poll() is None and time.monotonic() < deadline:
+
+        def is_there() -> bool:
             newest = newest_checkpoint(cwd / run_folder / "checkpoints")
-            if newest is not None and int(newest.name) >= step:
-                break
-            time.sleep(0.01)
+            return newest is not None and int(newest.name) >= step
+
+        wait_until(lambda: is_there() or process.poll() is not None)
         process.kill()
         assert process.wait() == -signal.SIGKILL, (cwd / "output").read_text()
 
