@@ -31,11 +31,11 @@ def main() -> None:
         import_module(f"sb3_chac.{command}").main(sys.argv[2:])
         return
 
-    from rl_zoo3.cli import main as zoo_main
-
     from sb3_chac.zoo import register
 
     register()
+    from rl_zoo3.cli import main as zoo_main  # takes the commands as they are now
+
     zoo_main()
 
 

@@ -17,7 +17,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_chac.common import pictures
-from sb3_chac.common.episodes import NotEvaluable, Runner, Task, make_env
+from sb3_chac.common.episodes import NotEvaluable, Runner, Task, make_env, registered_spec
 from sb3_chac.common.evaluation import saved_model
 from sb3_chac.evaluate import DEFAULT_ENV, check_output, find_algorithm, find_normalization, load_model, parse_env_kwargs
 from sb3_chac.human.dataset_writer import SETTINGS
@@ -250,7 +250,7 @@ class Replay(Runner):
     :param number: of the episode
     :param render_mode: of the environment
     :raises DatasetError: if there is no such episode, or neither its environment nor its seed is known
-    :raises NotEvaluable: if the environment cannot be made
+    :raises NotEvaluable: if the environment cannot be made, see ``registered_spec``
     """
 
     def __init__(self, dataset: "MinariDataset", number: int, render_mode: str | None = None) -> None:
@@ -265,6 +265,7 @@ class Replay(Runner):
         self.recorded = dataset[number]
         self.observations: list[np.ndarray] = []
         self.rewards: list[float] = []
+        spec = registered_spec(spec, f"dataset {dataset.id}")
         super().__init__(Task(lambda observation: None, spec, {}), render_mode)
 
     def __enter__(self) -> "Replay":

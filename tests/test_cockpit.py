@@ -333,12 +333,12 @@ def test_slow_updates_do_not_hold_up_the_drive(tmp_path):
         begun_at.append(drive.display.total_steps)
         wait_until(lambda: drive.display.total_steps >= begun_at[-1] + 12 or drive.ended)
         train_now(*args)
-        if len(begun_at) == 4:
+        if len(begun_at) >= 4:
             drive.quit()
 
     model.train_now = slowly
     model.learn(10_000)
-    assert len(begun_at) == 4 and np.diff(begun_at).min() >= 12 and drive.lag > 30
+    assert len(begun_at) >= 4 and np.diff(begun_at[:4]).min() >= 12 and drive.lag > 30
 
 
 def test_an_error_of_an_update_ends_the_drive(tmp_path):

@@ -52,9 +52,9 @@ class GuidedProgressBar(ProgressBarCallback):
         """
         counts = self.model.counts
         parts = [f"{name} {getattr(self.model, name)}" for name in ("stage", "round") if hasattr(self.model, name)]
-        choices: dict[str, list[np.ndarray]] = getattr(self.model, "choices", {})
+        choices = list(getattr(self.model, "choices", ()))[-self.refresh_every :]
         if choices:  # else the logger has just taken them
-            self.self_share = float(np.mean(choices["self_drives"][-self.refresh_every :]))
+            self.self_share = float(np.mean([choice["self_drives"] for choice in choices]))
         if self.self_share is not None:
             parts.append(f"self {100 * self.self_share:.0f} %")
         rate = counts["human_steps"] / max(counts["total_steps"], 1)
