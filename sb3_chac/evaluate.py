@@ -99,7 +99,7 @@ def main(arguments: list[str]) -> None:
     th.set_num_threads(1)
     try:
         run(args)
-    except (NotEvaluable, FileNotFoundError) as error:
+    except (NotEvaluable, OSError) as error:  # such as a full disk
         parser.exit(2, f"{parser.prog}: error: {error}\n")
 
 

@@ -30,6 +30,7 @@ from sb3_chac.human import (
     InterventionWrapper,
     ModelExpert,
     RiskRule,
+    RuleError,
     make_expert,
     make_rule,
 )
@@ -138,9 +139,9 @@ def test_a_rule_that_raises():
 
 
 def test_rules_must_answer_true_or_false():
-    with pytest.raises(TypeError, match="rule must return True or False, got None"):
+    with pytest.raises(RuleError, match=r"rule .* must return True or False, got None"):
         drive(armed(lambda *args: None), 1)
-    with pytest.raises(ValueError, match="NaN"):
+    with pytest.raises(RuleError, match="NaN"):
         drive(armed(risky([math.nan])), 1)
 
 

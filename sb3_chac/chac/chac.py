@@ -9,6 +9,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.sac.policies import Actor
 
 from sb3_chac.chac.policies import CONTROLS, CHACPolicy, CnnPolicy, MlpPolicy, MultiInputPolicy
+from sb3_chac.common.arguments import checked
 from sb3_chac.common.buffers import DualReplayBuffer, DualReplayBufferSamples
 from sb3_chac.common.checks import check_integer, check_range
 from sb3_chac.common.critics import DistributionalCritic
@@ -108,6 +109,7 @@ class CHAC(DPVP):
     self_actor: Actor
     self_actor_target: Actor
 
+    @checked
     def __init__(
         self,
         policy: str | type[CHACPolicy],

@@ -423,8 +423,8 @@ async def serve(
     async with server.listening():
         if not server.address.is_loopback and tls is None:
             print(
-                f"Warning: {address.host} can be reached from other machines, and nothing is encrypted. Safer: --tls-cert, or --serve "
-                f"127.0.0.1:{server.address.port}, and on your machine ssh -L {server.address.port}:127.0.0.1:"
+                f"Warning: {address.host} can be reached from other machines, and nothing is encrypted. Safer: --tls-cert, or "
+                f"--serve 127.0.0.1:{server.address.port}, and on your machine ssh -L {server.address.port}:127.0.0.1:"
                 f"{server.address.port} HERE.",
                 file=sys.stderr,
             )

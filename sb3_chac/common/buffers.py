@@ -10,6 +10,7 @@ from stable_baselines3.common.buffers import BaseBuffer, ReplayBuffer
 from stable_baselines3.common.type_aliases import TensorDict
 from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_chac.common.arguments import checked
 from sb3_chac.common.checks import check_integer, check_range
 
 Observation = np.ndarray | dict[str, np.ndarray]
@@ -48,6 +49,7 @@ class TransitionStore:
     :param columns: shape and dtype of one entry, by name
     """
 
+    @checked
     def __init__(self, capacity: int, columns: dict[str, tuple[tuple[int, ...], Any]]):
         self.capacity, self.columns = capacity, columns
         self.added = 0

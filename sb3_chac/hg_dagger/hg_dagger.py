@@ -13,6 +13,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Rollout
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_chac.bc.policies import LOSSES, BCPolicy, CnnPolicy, MlpPolicy
+from sb3_chac.common.arguments import checked
 from sb3_chac.common.buffers import DualReplayBuffer, TransitionStore
 from sb3_chac.common.checks import check_integer, check_range
 from sb3_chac.common.guided import GuidedOffPolicyAlgorithm
@@ -70,6 +71,7 @@ class HGDagger(GuidedOffPolicyAlgorithm):
     required_policy = BCPolicy
     policy: BCPolicy
 
+    @checked
     def __init__(
         self,
         policy: str | type[BCPolicy],

@@ -7,13 +7,18 @@ from gymnasium import spaces
 from gymnasium.error import ResetNeeded
 from gymnasium.utils import RecordConstructorArgs
 
-from sb3_chac.common.checks import check_action_space, check_integer
-from sb3_chac.human.experts import Expert, check_expert, expert_name, make_expert
+from sb3_chac.common.arguments import checked
+from sb3_chac.common.checks import check_action_space, check_integer, check_range
+from sb3_chac.human.experts import Expert, check_expert, expert_name, make_expert, within
 from sb3_chac.human.rules import TakeoverRule, check_rule, make_rule, scale_action
 
 
 class ExpertError(RuntimeError):
     """Raised when the expert fails or hands in something that is no action. The environment has not made the step."""
+
+
+class RuleError(RuntimeError):
+    """Raised when the rule fails or does not say who drives. The environment has not made the step."""
 
 
 class ControlState(StrEnum):
@@ -67,11 +72,15 @@ class InterventionWrapper(gym.Wrapper, RecordConstructorArgs):
     :param rule: when: "risk", "disagreement", "always", "never", a ``TakeoverRule`` or a function, see ``make_rule``
     :param budget: how many steps the human drives at most (of this environment, over all episodes), None for no limit
     :param armed: whether to arm it at once
+    :param deadline: seconds that the expert and the rule have for each answer, None for as long as they need. With one, they
+        are asked in a thread of their own, which is left to itself if it is late
     :param rule_kwargs: of the rule if it is "risk" (e.g. ``{"take_over_below": 1.8}``, see ``RiskRule``) or "disagreement"
     :raises ValueError: for an argument that does not fit; while armed, for an action that is not finite or of another shape
-    :raises ExpertError: from ``reset``, ``step`` and ``arm`` when the expert fails
+    :raises ExpertError: from ``reset``, ``step`` and ``arm`` when the expert fails or is late
+    :raises RuleError: likewise, of the rule
     """
 
+    @checked
     def __init__(
         self,
         env: gym.Env,
@@ -80,10 +89,18 @@ class InterventionWrapper(gym.Wrapper, RecordConstructorArgs):
         budget: int | None = None,
         armed: bool = False,
         rule_kwargs: dict[str, Any] | None = None,
+        deadline: float | None = None,
     ):
         # Not copied: a model may hold a replay buffer or subprocesses
         RecordConstructorArgs.__init__(
-            self, _disable_deepcopy=True, expert=expert, rule=rule, budget=budget, armed=armed, rule_kwargs=rule_kwargs
+            self,
+            _disable_deepcopy=True,
+            expert=expert,
+            rule=rule,
+            budget=budget,
+            armed=armed,
+            rule_kwargs=rule_kwargs,
+            deadline=deadline,
         )
         gym.Wrapper.__init__(self, env)
         check_action_space(env.action_space)
@@ -92,7 +109,9 @@ class InterventionWrapper(gym.Wrapper, RecordConstructorArgs):
         check_rule(rule, expert, rule_kwargs)
         if budget is not None:
             check_integer("budget", budget, low=0)
-        self.budget = budget
+        if deadline is not None:
+            check_range("deadline", deadline, low=0.0, exclusive_low=True)
+        self.budget, self.deadline = budget, deadline
         self._expert_argument, self._rule_arguments = expert, (rule, rule_kwargs)
         self._rule_in_force = self._rule_arguments
         self._expert: Expert | None = None  # both are built when first armed
@@ -293,10 +312,13 @@ class InterventionWrapper(gym.Wrapper, RecordConstructorArgs):
         assert self._expert is not None and self._rule is not None
         observation, self._observation = self._observation, None  # stays None if anything fails
         try:
-            self._expert.reset(seed=self._seed)
+            within(self.deadline, self._expert.reset, seed=self._seed)
         except Exception as error:
             raise self._expert_error(f"raised {type(error).__name__} in its reset: {error}.") from error
-        self._rule.reset()
+        try:
+            within(self.deadline, self._rule.reset)
+        except Exception as error:
+            raise self._rule_error(f"raised {type(error).__name__} in its reset: {error}.") from error
         self._observation, self._seed = observation, None
 
     def _ask_expert(self, observation: Any) -> np.ndarray:
@@ -305,7 +327,7 @@ class InterventionWrapper(gym.Wrapper, RecordConstructorArgs):
         """
         assert self._expert is not None
         try:
-            values = np.array(self._expert(observation), dtype=np.float64)
+            values = np.array(within(self.deadline, self._expert, observation), dtype=np.float64)
         except Exception as error:
             raise self._expert_error(f"raised {type(error).__name__}: {error}.") from error
         low, high = self._box.low.astype(np.float64), self._box.high.astype(np.float64)
@@ -328,10 +350,21 @@ class InterventionWrapper(gym.Wrapper, RecordConstructorArgs):
 
     def _ask_rule(self, observation: Any, novice_action: np.ndarray, expert_action: np.ndarray, was_driving: bool) -> bool:
         assert self._rule is not None
-        takeover = self._rule(observation, novice_action, expert_action, was_driving)
+        try:
+            takeover = within(self.deadline, self._rule, observation, novice_action, expert_action, was_driving)
+        except Exception as error:
+            raise self._rule_error(f"raised {type(error).__name__}: {error}.") from error
         if not isinstance(takeover, bool | np.bool_):
-            raise TypeError(f"rule must return True or False, got {takeover!r} from {self._rule_in_force[0]!r}.")
+            raise self._rule_error(f"must return True or False, got {takeover!r}.")
         return bool(takeover)
+
+    def _rule_error(self, problem: str) -> RuleError:
+        rule = self._rule_in_force[0]
+        name = repr(rule) if isinstance(rule, str) else getattr(rule, "__qualname__", type(rule).__name__)
+        return RuleError(
+            f"The rule {name} {problem} The environment did not make a step. Mend the rule or pass another as rule=..., and "
+            "go on with reset()."
+        )
 
     def _checked_novice_action(self, action: Any) -> np.ndarray:
         if self._observation is None:

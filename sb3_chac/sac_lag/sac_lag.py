@@ -12,6 +12,7 @@ from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy, ContinuousCritic
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 
+from sb3_chac.common.arguments import checked
 from sb3_chac.common.checks import check_integer
 from sb3_chac.common.lagrange import CostConstrainedAlgorithm, constrained_actor_loss
 from sb3_chac.common.off_policy_algorithm import CheckedOffPolicyAlgorithm
@@ -103,6 +104,7 @@ class SACLag(CostConstrainedAlgorithm, CheckedOffPolicyAlgorithm, SAC):
     cost_critic: ContinuousCritic
     cost_critic_target: ContinuousCritic
 
+    @checked
     def __init__(
         self,
         policy: str | type[SACLagPolicy],

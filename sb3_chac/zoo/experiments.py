@@ -29,7 +29,7 @@ from sb3_chac.common.guided import GuidedOffPolicyAlgorithm
 from sb3_chac.common.lagrange import CostConstrainedAlgorithm
 from sb3_chac.common.offline import OfflineAlgorithm
 from sb3_chac.envs import ENVIRONMENTS, ONE_PER_PROCESS, VALIDATION
-from sb3_chac.human.intervention import ExpertError
+from sb3_chac.human.intervention import ExpertError, RuleError
 from sb3_chac.zoo.errors import check_file, check_hyperparameters, check_options, one_line
 from sb3_chac.zoo.registration import ALGORITHMS, hyperparams_file
 
@@ -177,7 +177,7 @@ def learn(original: Callable[..., None], manager: Any, model: Any) -> None:
     after a checkpoint, if it writes any.
     """
     if is_ours(manager):
-        with one_line_of(manager, OSError, ValueError, ExpertError):
+        with one_line_of(manager, OSError, ValueError, ExpertError, RuleError):
             learn_ours(original, manager, model)
     else:
         original(model)
