@@ -37,10 +37,10 @@ DESCRIPTION = """Demonstrations are datasets in Minari's format, see 'minari lis
 
 RECORD = """Record whole episodes until there are at least --steps steps. With --novice, that model drives and the expert
 watches it, takes over by --rule and hands back. The dataset does not depend on --jobs; nothing is left of one that is
-interrupted."""
+interrupted. Models are code (docs/loading.md): open those that you trust only."""
 
 REPLAY = """Make the environment again, reset it with the recorded seed and scenario, and repeat the actions of one episode. It
-tells how far that led elsewhere than when it was recorded."""
+tells how far that led elsewhere than when it was recorded. The environment must be registered: a dataset runs no code."""
 
 
 def make_parser() -> argparse.ArgumentParser:

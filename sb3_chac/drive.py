@@ -37,7 +37,9 @@ DESCRIPTION = """Train with yourself as the human: watch the novice drive, take 
   sb3-chac drive --resume logs/chac/SafeDrive-v0_1                    go on, with all that was learned and driven
 
 Hyperparameters, run folders and files are those of 'rl_zoo3 train'. The drive is recorded as a dataset, see
-'sb3-chac demos'. The operator's guide is sb3_chac/cockpit/README.md."""
+'sb3-chac demos'. The operator's guide is sb3_chac/cockpit/README.md.
+
+Models, run folders and hyperparameters files are code (docs/loading.md): open those that you trust only."""
 
 SAVE_FREQ = 600  # steps: a minute
 

@@ -1,4 +1,4 @@
-"""Every argument of every constructor: what it cannot be gives one error that begins with its name, before anything is built."""
+"""Arguments of constructors: what one cannot be gives one error that begins with its name, before anything is built."""
 
 import inspect
 import math
