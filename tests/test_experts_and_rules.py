@@ -2,6 +2,7 @@
 
 import functools
 import math
+import threading
 
 import gymnasium as gym
 import numpy as np
@@ -23,6 +24,7 @@ from takeover_toys import (
     drive,
 )
 
+from sb3_chac import CHAC, DPVP, IWR, PVP, HGDagger
 from sb3_chac.human import (
     ControlState,
     DisagreementRule,
@@ -129,7 +131,7 @@ def test_a_rule_that_raises():
 
     env = armed(rule)
     drive(env, 1)
-    with pytest.raises(ZeroDivisionError):
+    with pytest.raises(RuleError, match="rule raised ZeroDivisionError"):
         env.step(NOVICE)
     assert len(env.unwrapped.executed) == 1 and env.state is ControlState.AUTONOMOUS and env.total_steps == 1
     with pytest.raises(ResetNeeded):
@@ -300,7 +302,7 @@ def test_bad_arguments_of_risk_rule(name, value):
 
 @pytest.mark.parametrize("threshold, space", [(-0.1, Integrator.action_space), (0.1, spaces.Discrete(2))])
 def test_bad_arguments_of_disagreement_rule(threshold, space):
-    with pytest.raises(ValueError, match=r"threshold|action space"):
+    with pytest.raises(ValueError, match=r"threshold|action.space"):
         DisagreementRule(threshold, space)
 
 
@@ -321,3 +323,48 @@ def test_rules_can_be_configured():
         InterventionWrapper(env, rule_kwargs={"hold": 0})
     with pytest.raises(ValueError, match=r"^rule_kwargs: only 'risk' and 'disagreement' take any, got rule='never'"):
         InterventionWrapper(env, rule="never", rule_kwargs={"hold": 4})
+
+
+# Deadlines and failures of both, while learning
+
+
+def never_answers(*args):
+    threading.Event().wait()
+
+
+def not_in_time(*args):
+    raise KeyError("lost")
+
+
+@pytest.mark.parametrize(
+    "expert, rule, error, problem",
+    [
+        (never_answers, "always", ExpertError, "expert never_answers .*no answer within 0.2 s"),
+        (constant, never_answers, RuleError, "rule never_answers .*no answer within 0.2 s"),
+        (not_in_time, "always", ExpertError, "expert not_in_time raised KeyError: 'lost'"),
+        (constant, not_in_time, RuleError, "rule not_in_time raised KeyError: 'lost'"),
+        (lambda observation: [np.nan, 0], "always", ExpertError, "NaN or infinite"),
+        (lambda observation: [0.1], "always", ExpertError, r"returned shape \(1,\)"),
+        (constant, lambda *args: np.nan, RuleError, "must return True or False, got nan"),
+        (constant, lambda *args: [True], RuleError, r"must return True or False, got \[True\]"),
+    ],
+)
+@pytest.mark.parametrize("algorithm", [PVP, DPVP, CHAC, HGDagger, IWR])
+def test_who_fails_is_named_and_the_model_can_be_saved(tmp_path, algorithm, expert, rule, error, problem):
+    env = InterventionWrapper(Integrator(), expert=expert, rule=rule, deadline=0.2)
+    model = algorithm("MlpPolicy", env, buffer_size=50, policy_kwargs={"net_arch": [8]})
+    if algorithm in (HGDagger, IWR):
+        model.warm_up_steps = 0  # there the rule is "always"
+    with pytest.raises(error, match=problem):
+        model.learn(20)
+    model.save(tmp_path / "model")
+    model.save_replay_buffer(tmp_path / "buffer")
+    assert algorithm.load(tmp_path / "model").num_timesteps == model.num_timesteps
+
+
+def test_an_action_that_cannot_be_written_to_is_one():
+    action = np.array([0.5, 0.25])
+    action.flags.writeable = False
+    env = InterventionWrapper(Integrator(), expert=lambda observation: action, rule="always", armed=True)
+    env.reset(seed=0)
+    assert np.allclose(env.step(NOVICE)[4]["applied_action"], action)

@@ -11,9 +11,10 @@ import typing
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeVar
 
+import gymnasium as gym
 import numpy as np
 import torch as th
-from stable_baselines3.common import vec_env
+from stable_baselines3.common.vec_env import VecEnv
 
 Init = TypeVar("Init", bound=Callable[..., None])
 
@@ -50,6 +51,7 @@ RANGES = {
     "stats_window_size": Range(1),
     "verbose": Range(0),
     "seed": Range(0, 2**32 - 1),
+    "n_envs": Range(1),
 }
 
 
@@ -65,7 +67,7 @@ def checked(init: Init) -> Init:
     def call(self: Any, *args: Any, **kwargs: Any) -> None:
         if kwargs.get("_init_setup_model", True):
             if not hints:  # now, as they may name what is defined after the class
-                hints.update(typing.get_type_hints(init, localns={"vec_env": vec_env}))  # SB3's GymEnv names it
+                hints.update(annotations(init))
             for name, value in signature.bind(self, *args, **kwargs).arguments.items():
                 if name in hints:
                     check_argument(name, value, hints[name])
@@ -73,6 +75,13 @@ def checked(init: Init) -> Init:
         init(self, *args, **kwargs)
 
     return typing.cast(Init, call)
+
+
+def annotations(init: Callable[..., None]) -> dict[str, Any]:
+    """
+    :return: those of the arguments, by name
+    """
+    return typing.get_type_hints(init, localns={"VecEnv": VecEnv})  # SB3's GymEnv names it
 
 
 def check_argument(name: str, value: Any, hint: Any) -> None:
@@ -97,12 +106,15 @@ def check_argument(name: str, value: Any, hint: Any) -> None:
 def check_name(owner: type, name: str, value: Any) -> None:
     """
     :param owner: class whose argument it is
-    :raises ValueError: for a policy or a device that does not exist
+    :raises ValueError: for a policy, an environment or a device that does not exist
     """
     if not isinstance(value, str):
         return
     if name == "policy" and value not in (aliases := getattr(owner, "policy_aliases", {value: None})):
         raise ValueError(f"policy must be one of {', '.join(aliases)}, or a class of policies, got {value!r}.")
+    known = {*gym.registry, *(entry.rpartition("-v")[0] for entry in gym.registry)}  # gymnasium finds the version by itself
+    if name == "env" and ":" not in value and value not in known:
+        raise ValueError(f"env must be an environment or the id of one that gymnasium knows, got {value!r}.")
     if name == "device" and value != "auto":
         try:
             th.device(value)

@@ -49,7 +49,6 @@ class TransitionStore:
     :param columns: shape and dtype of one entry, by name
     """
 
-    @checked
     def __init__(self, capacity: int, columns: dict[str, tuple[tuple[int, ...], Any]]):
         self.capacity, self.columns = capacity, columns
         self.added = 0
@@ -107,6 +106,7 @@ class DualReplayBuffer(ReplayBuffer):
     :raises ValueError: for an argument that does not fit
     """
 
+    @checked
     def __init__(
         self,
         buffer_size: int,
