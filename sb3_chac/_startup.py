@@ -77,5 +77,8 @@ def import_own_package() -> None:
 
 def install() -> None:
     """Put the import hook in place, once."""
-    if not os.environ.get("SB3_CHAC_NO_AUTOLOAD") and not any(type(finder) is _ZooFinder for finder in sys.meta_path):
+    if os.environ.get("SB3_CHAC_NO_AUTOLOAD"):
+        return
+    # By its name: this module may be loaded by its path and imported as well
+    if not any(type(finder).__name__ == _ZooFinder.__name__ for finder in sys.meta_path):
         sys.meta_path.insert(0, _ZooFinder())

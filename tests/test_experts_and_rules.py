@@ -2,6 +2,7 @@
 
 import functools
 import math
+import queue
 import threading
 
 import gymnasium as gym
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 from gymnasium.error import ResetNeeded
+from shell import wait_until
 from stable_baselines3 import SAC
 from takeover_toys import (
     EXPERT,
@@ -328,8 +330,20 @@ def test_rules_can_be_configured():
 # Deadlines and failures of both, while learning
 
 
+asleep = threading.Event()
+
+
 def never_answers(*args):
+    asleep.set()
     threading.Event().wait()
+
+
+class Answers(queue.Queue):
+    """Of a thread: the time is over as soon as it sleeps, and not before, however slow the machine is."""
+
+    def get(self, timeout):
+        wait_until(lambda: self.qsize() or asleep.is_set())
+        return super().get(block=False)
 
 
 def not_in_time(*args):
@@ -350,7 +364,9 @@ def not_in_time(*args):
     ],
 )
 @pytest.mark.parametrize("algorithm", [PVP, DPVP, CHAC, HGDagger, IWR])
-def test_who_fails_is_named_and_the_model_can_be_saved(tmp_path, algorithm, expert, rule, error, problem):
+def test_who_fails_is_named_and_the_model_can_be_saved(tmp_path, monkeypatch, algorithm, expert, rule, error, problem):
+    asleep.clear()
+    monkeypatch.setattr("sb3_chac.human.experts.queue.SimpleQueue", Answers)
     env = InterventionWrapper(Integrator(), expert=expert, rule=rule, deadline=0.2)
     model = algorithm("MlpPolicy", env, buffer_size=50, policy_kwargs={"net_arch": [8]})
     if algorithm in (HGDagger, IWR):
