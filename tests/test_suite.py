@@ -19,7 +19,7 @@ import suite_job  # noqa: E402
 import suite_report  # noqa: E402
 from suite_job import Job, Outcome  # noqa: E402
 
-from sb3_chac.common.checkpoints import newest_checkpoint  # noqa: E402
+from sb3_chac.common.checkpoints import newest_checkpoint, sound_checkpoint  # noqa: E402
 
 ROWS = {row.name: row for row in suite.ROWS}
 
@@ -168,6 +168,24 @@ def test_a_killed_suite_goes_on_from_checkpoints_and_takes_its_processes_along(t
     assert len(rows) == len(suite_job.TEST_MAPS)
     assert int(rows[0]["total_steps"]) == 1000
     assert subprocess.run(arguments, capture_output=True, text=True).stdout.startswith("1 jobs: 1 done, 0 to do")
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_ends_the_suite_and_its_jobs_in_good_order(tmp_path, number):
+    arguments = command(tmp_path, "run", "--rows", "pvp", "bc", "--seeds", "1", "--scale", "0.02", "--jobs", "1")
+    process = subprocess.Popen(arguments, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+    folder = tmp_path / "work" / "pvp-0"
+    begun = folder / "logs" / "pvp" / "SafeDrive-v0_1" / "progress.csv"
+    wait_until(lambda: begun.exists() or process.poll() is not None, pause=0.2)
+    process.send_signal(number)
+    _, complaints = process.communicate(timeout=FOREVER)
+    assert process.returncode == 128 + number
+    assert complaints.splitlines()[-1] == (
+        f"Stopped by {signal.Signals(number).name}; the same command goes on from the checkpoints."
+    )
+    assert "Traceback" not in complaints and "Stopped by SIGTERM at step" in (folder / "log.txt").read_text()
+    assert sound_checkpoint(begun.parent / "checkpoints")[0] is not None
+    assert not (tmp_path / "work" / "bc-0" / "demonstrations").exists()  # the next one was not begun
 
 
 def test_a_failed_job_does_not_stop_the_others(tmp_path):
