@@ -95,3 +95,19 @@ def test_what_signatures_say_is_what_the_defaults_are(owner):
     for name, parameter in inspect.signature(owner).parameters.items():
         if name not in NOT_CHECKED and parameter.default is not inspect.Parameter.empty:
             assert fits(parameter.default, hints[name]), name
+
+
+@pytest.mark.parametrize(
+    "schedule, is_good", [(lambda left: 0.2 * left, True), (lambda left: math.nan, False), (lambda left: -left, False)]
+)
+@pytest.mark.parametrize("name", ["clip_range", "clip_range_vf", "learning_rate"])
+@pytest.mark.parametrize("algorithm", [sb3_chac.PPOLag, sb3_chac.GAIL])
+def test_schedules_are_looked_into(algorithm, name, schedule, is_good):
+    def make():
+        return algorithm("MlpPolicy", "Pendulum-v1", **{name: schedule})
+
+    if is_good:
+        make()
+    else:
+        with pytest.raises(ValueError, match=f"^{name} must be"):
+            make()

@@ -68,7 +68,7 @@ ZOO = [
     ("-params env_wrapper:'nowhere.Wrapper'", "nowhere"),
     ("-params env_wrapper:1", "env_wrapper"),
     ("-params env_wrapper:[{'sb3_chac.human.InterventionWrapper':{'nonsense':1}}]", "nonsense"),
-    ("-params env_wrapper:[{'sb3_chac.human.InterventionWrapper':{'budget':-1}}]", "budget"),
+    ("-params env_wrapper:[{'sb3_chac.human.InterventionWrapper':{'budget':-1}}] --env SafeDrive-v0", "budget"),
     ("-params vec_env_wrapper:'nowhere.Wrapper'", "nowhere"),
     ("-params callback:'nowhere.Callback'", "nowhere"),
     ("-params callback:1", "callback"),
@@ -81,7 +81,7 @@ ZOO = [
     ("-params dataset:'nowhere-v0' --algo bc", "nowhere-v0"),
     ("-params cost_limit:-1 --algo sac_lag", "cost_limit"),
     ("-params clip_range:'nonsense' --algo ppo_lag", "clip_range"),
-    ("-params clip_range:float('nan') --algo gail", "clip_range"),
+    ("-params clip_range:float('nan') --algo ppo_lag", "clip_range"),
     ("-params gae_lambda:-1 --algo ppo_lag", "gae_lambda"),
 ]
 FILES = [
@@ -149,7 +149,7 @@ def test_hyperparameters_files(complaint, tmp_path, content, named):
 def test_numbers_of_rl_zoo3_files_are_fine():
     from sb3_chac.zoo.errors import check_hyperparameters
 
-    check_hyperparameters(yaml.safe_load("{n_timesteps: !!float 1e6, learning_rate: lin_7.3e-4, n_envs: 2}"), -1)
+    check_hyperparameters(yaml.safe_load("{policy: MlpPolicy, n_timesteps: !!float 1e6, learning_rate: lin_7.3e-4}"), -1)
 
 
 OWN = [

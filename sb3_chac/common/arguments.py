@@ -55,6 +55,9 @@ RANGES = {
 }
 
 
+SCHEDULES = ("clip_range", "clip_range_vf")  # that nobody else checks; they may end at 0
+
+
 def checked(init: Init) -> Init:
     """
     :param init: ``__init__`` of a class. What does not fit the annotation of an argument, or is NaN or infinite, raises a
@@ -97,6 +100,10 @@ def check_argument(name: str, value: Any, hint: Any) -> None:
     for number in numbers_in(value):
         if limits is not None and number not in limits:
             raise ValueError(f"{name} must be a number {limits}, got {value!r}.")
+    if name in SCHEDULES and callable(value):
+        start, end = float(value(1.0)), float(value(0.0))
+        if start not in RANGES[name] or not 0 <= end < math.inf:
+            raise ValueError(f"{name} must be a schedule of numbers {RANGES[name]}, got one from {start} to {end}.")
     if name == "sde_sample_freq" and value != -1 and value < 1:
         raise ValueError(f"sde_sample_freq must be an integer of at least 1, or -1 (once a rollout), got {value!r}.")
     if name == "train_freq" and isinstance(value, tuple) and value[1] not in ("step", "episode"):
@@ -124,7 +131,7 @@ def check_name(owner: type, name: str, value: Any) -> None:
 
 def numbers_in(value: Any) -> list[float]:
     """
-    :return: a number itself, those at both ends of a schedule, the first of a train_freq; none of anything else
+    :return: a number itself, the first of a train_freq; none of anything else
     """
     if isinstance(value, tuple) and value:
         value = value[0]
@@ -162,7 +169,7 @@ def fits(value: Any, hint: Any) -> bool:
     return isinstance(value, kind)
 
 
-WORDS = {int: "an integer", float: "a finite number", bool: "True or False", str: "text", type(None): "None"}
+WORDS = {int: "an integer", float: "a finite number", bool: "True or False", str: "text", dict: "a dict", type(None): "None"}
 
 
 def describe(hint: Any) -> str:

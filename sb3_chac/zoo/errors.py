@@ -11,7 +11,23 @@ from typing import Any
 
 import yaml
 
+from sb3_chac.common.arguments import describe
+
 TRACEBACK = "SB3_CHAC_TRACEBACK"  # environment variable that brings it back
+
+
+# What RL-Zoo3 takes for its own hyperparameters
+KINDS = {
+    "normalize": bool | dict | str,
+    "callback": str | dict | list,
+    "env_wrapper": str | dict | list,
+    "vec_env_wrapper": str | dict | list,
+    "policy_kwargs": dict | str,
+    "replay_buffer_kwargs": dict | str,
+    "monitor_kwargs": dict | str,
+}
+EVALUATED = ("policy_kwargs", "replay_buffer_class", "replay_buffer_kwargs", "monitor_kwargs", "normalize")  # if they are text
+NOISES = ("normal", "ornstein-uhlenbeck")
 
 
 @contextmanager
@@ -80,6 +96,16 @@ def check_hyperparameters(hyperparams: dict[str, Any], n_timesteps: int) -> None
             schedule, _, start = value.partition("_")
             if name == "ent_coef_lr" or schedule != "lin" or not is_a_number(start):
                 raise ValueError(f"{name} must be a number, or lin_ and one (a linear schedule), got {value!r}.")
+    for name, kinds in KINDS.items():
+        if not isinstance(hyperparams.get(name), kinds | None):
+            raise ValueError(f"{name} must be {describe(kinds)}, got {hyperparams[name]!r}.")
+    if not isinstance(hyperparams.get("policy"), str):
+        raise ValueError(f"policy must be the name of one, such as MlpPolicy, got {hyperparams.get('policy')!r}.")
+    if "noise_type" in hyperparams:
+        if not any(known in str(hyperparams["noise_type"]) for known in NOISES):
+            raise ValueError(f"noise_type must be one of {', '.join(NOISES)}, got {hyperparams['noise_type']!r}.")
+        if "noise_std" not in hyperparams:
+            raise ValueError("noise_type needs noise_std, the standard deviation of the noise.")
     if n_timesteps <= 0 and "n_timesteps" not in hyperparams:
         raise ValueError("n_timesteps is missing: give -n, or write it into the yaml.")
     for name, low in (("n_timesteps", 1), ("n_envs", 1), ("frame_stack", 1)):
@@ -87,6 +113,19 @@ def check_hyperparameters(hyperparams: dict[str, Any], n_timesteps: int) -> None
         # RL-Zoo3's own files write 1e6, which is a float
         if value is not None and (isinstance(value, bool | str) or not is_whole(value) or value < low):
             raise ValueError(f"{name} must be a whole number of at least {low}, got {value!r}.")
+
+
+@contextmanager
+def evaluating(hyperparams: dict[str, Any]) -> Iterator[None]:
+    """
+    :param hyperparams: that RL-Zoo3 evaluates inside the block, if they are text
+    :raises ValueError: names those that may not be Python
+    """
+    texts = [name for name in EVALUATED if isinstance(hyperparams.get(name), str)]
+    try:
+        yield
+    except (NameError, SyntaxError) as error:
+        raise ValueError(f"{' or '.join(texts)} cannot be evaluated: {error}") from error
 
 
 def is_a_number(text: str) -> bool:

@@ -30,7 +30,7 @@ from sb3_chac.common.lagrange import CostConstrainedAlgorithm
 from sb3_chac.common.offline import OfflineAlgorithm
 from sb3_chac.envs import ENVIRONMENTS, ONE_PER_PROCESS, VALIDATION
 from sb3_chac.human.intervention import ExpertError, RuleError
-from sb3_chac.zoo.errors import check_file, check_hyperparameters, check_options, one_line
+from sb3_chac.zoo.errors import check_file, check_hyperparameters, check_options, evaluating, one_line
 from sb3_chac.zoo.registration import ALGORITHMS, hyperparams_file
 
 # Steps between two checkpoints unless --save-freq says otherwise: what a person does at most for nothing
@@ -130,7 +130,8 @@ def preprocess_hyperparams(original: Callable[..., Any], manager: Any, hyperpara
     """Our environments are evaluated on maps that are neither those of the training nor those of the final test."""
     if is_ours(manager):
         check_hyperparameters(hyperparams, manager.n_timesteps)
-    processed = original(hyperparams)
+    with evaluating(hyperparams):
+        processed = original(hyperparams)
     env_id = manager.env_name.gym_id
     if manager._eval_env_kwargs_args is None and env_id in VALIDATION:
         manager.eval_env_kwargs = {**manager.env_kwargs, **VALIDATION[env_id]}
