@@ -37,7 +37,9 @@ and steps, as mean ± standard deviation over the episodes. The results do not d
 
 If <folder of the model>/<env>/vecnormalize.pkl exists, where RL-Zoo3 leaves it, observations are normalized with it.
 Cost, success and route completion are only reported if the environment's info has 'cost', 'is_success' and
-'route_completion' in every episode; the JSON file leaves out what is not there. Load models that you trust only."""
+'route_completion' in every episode; the JSON file leaves out what is not there.
+
+A model and its vecnormalize.pkl are code (docs/loading.md): load those that you trust only."""
 
 
 def make_parser() -> argparse.ArgumentParser:

@@ -1,5 +1,6 @@
 """Checkpoints: two are kept, what is damaged is not used, signals end a training in good order, data runs no code."""
 
+import inspect
 import json
 import os
 import shutil
@@ -16,9 +17,10 @@ from guided_toys import make_guided
 from shell import FOREVER, wait_until
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.callbacks import ConvertCallback
+from test_zoo import swings
 
 import sb3_chac
-from sb3_chac import BC, CHAC, DPVP, DSAC, IWR, PVP, HGDagger, PPOLag, SACLag
+from sb3_chac import CHAC, DPVP, DSAC, SACLag
 from sb3_chac.common.checkpoints import (
     BUFFER,
     CONTENTS,
@@ -31,6 +33,7 @@ from sb3_chac.common.checkpoints import (
     sound_checkpoint,
     verify,
 )
+from sb3_chac.zoo.registration import ALGORITHMS
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 SMALL = {"policy_kwargs": {"net_arch": [8]}, "buffer_size": 200}
@@ -178,10 +181,13 @@ def test_weights_load_without_code():
         assert sb3_chac.common.checkpoints.verify_model(path)["policy_class"]  # torch.load(..., weights_only=True)
 
 
-@pytest.mark.parametrize("algorithm", [PVP, DPVP, CHAC, HGDagger, IWR, DSAC, SACLag, PPOLag, BC])
-def test_saved_weights_of_every_algorithm_load_without_code(tmp_path, algorithm):
-    kwargs = {} if algorithm in (PPOLag, BC) else {"buffer_size": 10}
-    algorithm("MlpPolicy", "Pendulum-v1", policy_kwargs={"net_arch": [8]}, **kwargs).save(tmp_path / "model.zip")
+@pytest.mark.parametrize("name", ALGORITHMS.values())
+def test_saved_weights_of_every_algorithm_load_without_code(tmp_path, name):
+    algorithm = getattr(sb3_chac, name)
+    given = {"dataset": swings(), "buffer_size": 10, "policy_kwargs": {"net_arch": [8]}}
+    accepted = inspect.signature(algorithm).parameters
+    kwargs = {argument: value for argument, value in given.items() if argument in accepted}
+    algorithm("MlpPolicy", "Pendulum-v1", **kwargs).save(tmp_path / "model.zip")
     assert sb3_chac.common.checkpoints.verify_model(tmp_path / "model.zip")
 
 
