@@ -38,7 +38,9 @@ and steps, as mean ± standard deviation over the episodes. The results do not d
 
 If <folder of the model>/<env>/vecnormalize.pkl exists, where RL-Zoo3 leaves it, observations are normalized with it.
 Cost, success and route completion are only reported if the environment's info has 'cost', 'is_success' and
-'route_completion' in every episode; the JSON file leaves out what is not there. Load models that you trust only."""
+'route_completion' in every episode; the JSON file leaves out what is not there.
+
+A model and its vecnormalize.pkl are code (docs/loading.md): load those that you trust only."""
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -100,7 +102,7 @@ def main(arguments: list[str]) -> None:
     th.set_num_threads(1)
     try:
         run(args)
-    except (NotEvaluable, FileNotFoundError) as error:
+    except (NotEvaluable, OSError) as error:  # such as a full disk
         parser.exit(2, f"{parser.prog}: error: {error}\n")
 
 

@@ -7,6 +7,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 
 from sb3_chac.bc.policies import LOSSES, BCPolicy, CnnPolicy, MlpPolicy
+from sb3_chac.common.arguments import checked
 from sb3_chac.common.checks import check_range
 from sb3_chac.common.offline import Batch, OfflineAlgorithm
 from sb3_chac.common.utils import minimize
@@ -56,6 +57,7 @@ class BC(OfflineAlgorithm):
     required_policy = BCPolicy
     policy: BCPolicy
 
+    @checked
     def __init__(
         self,
         policy: str | type[BCPolicy],

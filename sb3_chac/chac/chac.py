@@ -1,4 +1,4 @@
-from collections import defaultdict
+from collections import deque
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -9,6 +9,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.sac.policies import Actor
 
 from sb3_chac.chac.policies import CONTROLS, CHACPolicy, CnnPolicy, MlpPolicy, MultiInputPolicy
+from sb3_chac.common.arguments import checked
 from sb3_chac.common.buffers import DualReplayBuffer, DualReplayBufferSamples, take_rows
 from sb3_chac.common.checks import check_integer, check_range
 from sb3_chac.common.critics import DistributionalCritic
@@ -17,6 +18,8 @@ from sb3_chac.common.utils import TargetUpdate, minimize
 from sb3_chac.dpvp.dpvp import DPVP
 
 SelfCHAC = TypeVar("SelfCHAC", bound="CHAC")
+
+MOST_CHOICES = 1000  # steps of which the logger is told who drove, at most
 
 
 class CHAC(DPVP):
@@ -122,6 +125,7 @@ class CHAC(DPVP):
     self_actor: Actor
     self_actor_target: Actor
 
+    @checked
     def __init__(
         self,
         policy: str | type[CHACPolicy],
@@ -253,7 +257,8 @@ class CHAC(DPVP):
         self.confidence_update = TargetUpdate(self.confidence_critic, self.confidence_critic_target)
         self.self_update = TargetUpdate(self.self_actor, self.self_actor_target)
         self.self_average_update = TargetUpdate(self.self_actor, self.policy.averaged_self_actor)
-        self.choices: defaultdict[str, list[np.ndarray]] = defaultdict(list)
+        # Since the logger took them, or the latest: nobody may ever take them
+        self.choices: deque[dict[str, np.ndarray]] = deque(maxlen=MOST_CHOICES)
 
     def _create_aliases(self) -> None:
         super()._create_aliases()
@@ -424,9 +429,8 @@ class CHAC(DPVP):
         self.policy.last_choice = None
         sampled = super()._sample_action(learning_starts, action_noise, n_envs)
         if self.policy.last_choice is not None:
-            for name, values in self.policy.last_choice._asdict().items():
-                if name != "actions":
-                    self.choices[name].append(values.cpu().numpy())
+            choice = self.policy.last_choice._asdict()
+            self.choices.append({name: values.cpu().numpy() for name, values in choice.items() if name != "actions"})
         return sampled
 
     def predict(
@@ -455,7 +459,7 @@ class CHAC(DPVP):
     def dump_logs(self) -> None:
         self.logger.record("chac/stage", self.stage)
         if self.choices:
-            means = {name: np.concatenate(values) for name, values in self.choices.items()}
+            means = {name: np.concatenate([choice[name] for choice in self.choices]) for name in self.choices[0]}
             self.choices.clear()
             confidence = means.pop("confidence")
             self.logger.record("chac/self_share", means.pop("self_drives").mean())

@@ -13,7 +13,7 @@ from gymnasium.envs.registration import EnvSpec
 
 from sb3_chac.common.checkpoints import sync
 from sb3_chac.human.dataset_writer import DatasetWriter, folder_to_make, storable_spec
-from sb3_chac.human.demonstrations import check_spaces
+from sb3_chac.human.demonstrations import DatasetError, check_spaces
 from sb3_chac.human.recording import Recorder as EpisodeRecorder
 
 if TYPE_CHECKING:
@@ -85,6 +85,8 @@ class Recorder:
     def __init__(self, folder: Path, env: gym.Env, dataset: str, policy: str, seconds_per_step: float) -> None:
         check_spaces(env.observation_space, env.action_space)
         folder_to_make(dataset, overwrite=False)
+        from minari.serialization import serialize_space
+
         self.run_folder, self.env = folder, env
         self.folder = folder / FOLDER
         self.folder.mkdir(parents=True, exist_ok=True)
@@ -96,6 +98,7 @@ class Recorder:
             "policy": policy,
             "seconds_per_step": seconds_per_step,
             "spec": spec.to_json() if spec else None,
+            "spaces": [serialize_space(space) for space in (env.observation_space, env.action_space)],
         }
         write_safely(self.folder / ABOUT, json.dumps(about).encode())
         self.number = 0
@@ -164,11 +167,25 @@ def finish_recording(run_folder: Path) -> Summary | None:
     if not (run_folder / FOLDER / ABOUT).is_file():
         return None
     about = json.loads((run_folder / FOLDER / ABOUT).read_text())
-    env = gym.make(EnvSpec.from_json(about["spec"]))
-    try:
-        return _finish(run_folder, env)
-    finally:
-        env.close()
+    return _finish(run_folder, RecordedEnv(about))
+
+
+class RecordedEnv(gym.Env):
+    """
+    What is known of an environment that was recorded, to be written down. It is never made: a file runs no code.
+
+    :param about: what ``Recorder`` has written
+    :raises DatasetError: if that is damaged
+    """
+
+    def __init__(self, about: dict[str, Any]) -> None:
+        from minari.serialization import deserialize_space
+
+        try:
+            self.observation_space, self.action_space = map(deserialize_space, about["spaces"])
+            self.spec = EnvSpec.from_json(about["spec"]) if about["spec"] else None
+        except Exception as error:  # nearly anything, of a damaged file
+            raise DatasetError(f"{ABOUT} of the drive cannot be read: {type(error).__name__}: {error}") from error
 
 
 def _finish(run_folder: Path, env: gym.Env) -> Summary:

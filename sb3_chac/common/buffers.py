@@ -11,6 +11,7 @@ from stable_baselines3.common.buffers import BaseBuffer, ReplayBuffer
 from stable_baselines3.common.type_aliases import TensorDict
 from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_chac.common.arguments import checked
 from sb3_chac.common.checks import check_integer, check_range
 from sb3_chac.common.contract import NOVICE_ACTION, TAKEOVER, TAKEOVER_START
 
@@ -121,6 +122,7 @@ class DualReplayBuffer(ReplayBuffer):
     :raises ValueError: for an argument that does not fit
     """
 
+    @checked
     def __init__(
         self,
         buffer_size: int,

@@ -53,9 +53,9 @@ class GuidedProgressBar(ProgressBarCallback):
         """
         counts = self.model.counts
         parts = [f"{name} {getattr(self.model, name)}" for name in ("stage", "round") if hasattr(self.model, name)]
-        choices: dict[str, list[np.ndarray]] = getattr(self.model, "choices", {})
+        choices = list(getattr(self.model, "choices", ()))[-self.refresh_every :]
         if choices:  # else the logger has just taken them
-            self.self_share = float(np.mean(choices["self_drives"][-self.refresh_every :]))
+            self.self_share = float(np.mean([choice["self_drives"] for choice in choices]))
         if self.self_share is not None:
             parts.append(f"self {100 * self.self_share:.0f} %")
         rate = counts["human_steps"] / max(counts["total_steps"], 1)
@@ -81,7 +81,7 @@ class SafetyCost(BaseCallback):
         self.is_measured = self.is_measured or any(cost is not None for cost in costs)
         if self.is_measured:  # else it would look like a zero
             self.model.safety_cost = getattr(self.model, "safety_cost", 0.0) + sum(filter(None, costs))  # type: ignore[attr-defined]
-            self.logger.record("safety/safety_cost", self.model.safety_cost)
+            self.logger.record("safety/safety_cost", self.model.safety_cost)  # type: ignore[attr-defined]
         return True
 
 

@@ -34,6 +34,22 @@ def check_action_space(action_space: spaces.Space) -> None:
         )
 
 
+def check_driving_action(action: Any) -> None:
+    """
+    :param action: [steering, acceleration], handed to an environment
+    :raises ValueError: unless it is two finite numbers
+    """
+    try:
+        numbers = np.asarray(action, dtype=float)
+    except (TypeError, ValueError):
+        numbers = np.array(np.nan)
+    if numbers.shape != (2,) or not np.isfinite(numbers).all():
+        raise ValueError(
+            f"action must be two finite numbers, [steering, acceleration], got {action!r}. The environment did not make a "
+            "step: look for the NaN or the shape where the action comes from."
+        )
+
+
 def check_range(name: str, value: Any, low: float = -math.inf, high: float = math.inf, exclusive_low: bool = False) -> None:
     """
     :param name: name of the argument, for the message

@@ -107,7 +107,7 @@ class GuidedOffPolicyAlgorithm(CheckedOffPolicyAlgorithm):
         self.replay_buffer.end_trajectories()
         normalize = self._vec_normalize_env
         if normalize is not None and normalize.training and normalize.norm_obs:
-            normalize.obs_rms.update(data.observations)  # type: ignore[union-attr]
+            normalize.obs_rms.update(data.observations)
 
     @staticmethod
     def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:

@@ -93,7 +93,7 @@ def fix_statistics(normalize: VecNormalize | None, observations: np.ndarray) -> 
     :param observations: that a model is about to be fitted to, not normalized, shape (n, *observation_shape)
     """
     if normalize is not None and normalize.training and normalize.norm_obs:
-        normalize.obs_rms = FixedStatistics(observations)
+        normalize.obs_rms = FixedStatistics(observations)  # type: ignore[assignment]
 
 
 def detach_distributions(policy: nn.Module) -> None:

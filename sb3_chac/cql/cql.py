@@ -9,6 +9,7 @@ from stable_baselines3.common.utils import FloatSchedule, update_learning_rate
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.sac.policies import Actor
 
+from sb3_chac.common.arguments import checked
 from sb3_chac.common.checks import check_action_space, check_integer, check_learning_rate, check_range
 from sb3_chac.common.offline import Batch, OfflineAlgorithm
 from sb3_chac.common.utils import TargetUpdate, detach_distributions, frozen, initial_ent_coef, minimize
@@ -81,6 +82,7 @@ class CQL(OfflineAlgorithm):
     critic: ContinuousCritic
     critic_target: ContinuousCritic
 
+    @checked
     def __init__(
         self,
         policy: str | type[CQLPolicy],

@@ -11,6 +11,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, PyTorch
 from stable_baselines3.common.utils import FloatSchedule, update_learning_rate
 from stable_baselines3.sac.policies import Actor
 
+from sb3_chac.common.arguments import checked
 from sb3_chac.common.checks import check_integer, check_learning_rate, check_range
 from sb3_chac.common.critics import DistributionalCritic
 from sb3_chac.common.distributional import gaussian_nll, gaussian_surrogate_loss, return_targets
@@ -106,6 +107,7 @@ class DSAC(CheckedOffPolicyAlgorithm):
     critic_target: DistributionalCritic
     log_ent_coef: th.nn.Parameter
 
+    @checked
     def __init__(
         self,
         policy: str | type[DSACPolicy],

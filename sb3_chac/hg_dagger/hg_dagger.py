@@ -12,6 +12,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Rollout
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_chac.bc.policies import LOSSES, BCPolicy, CnnPolicy, MlpPolicy
+from sb3_chac.common.arguments import checked
 from sb3_chac.common.buffers import DualReplayBuffer, TransitionStore
 from sb3_chac.common.checks import check_integer, check_range
 from sb3_chac.common.guided import GuidedOffPolicyAlgorithm
@@ -73,6 +74,7 @@ class HGDagger(GuidedOffPolicyAlgorithm):
     required_policy = BCPolicy
     policy: BCPolicy
 
+    @checked
     def __init__(
         self,
         policy: str | type[BCPolicy],
@@ -238,7 +240,7 @@ class HGDagger(GuidedOffPolicyAlgorithm):
             return
         fix_statistics(self._vec_normalize_env, observations)
         if self._vec_normalize_env is not None and self._last_original_obs is not None:
-            self._last_obs = self._vec_normalize_env.normalize_obs(self._last_original_obs)  # type: ignore[assignment]
+            self._last_obs = self._vec_normalize_env.normalize_obs(self._last_original_obs)
         # Switch to train mode (this affects batch norm / dropout)
         self.policy.set_training_mode(True)
         self._update_learning_rate(self.policy.optimizer)

@@ -164,7 +164,7 @@ def joined(parts: Sequence[Demonstrations]) -> Demonstrations:
         numbers = np.cumsum(np.diff(part.episodes, prepend=part.episodes[:1]) != 0)
         episodes.append(numbers + offset)
         offset += int(numbers[-1]) + 1
-    columns = {}
+    columns: dict[str, Any] = {}
     for field in fields(Demonstrations):
         values = [getattr(part, field.name) for part in parts]
         if field.name not in ("observation_space", "action_space", "episodes"):

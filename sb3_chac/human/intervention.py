@@ -9,13 +9,18 @@ from gymnasium.error import ResetNeeded
 from gymnasium.utils import RecordConstructorArgs
 
 from sb3_chac.common import contract
-from sb3_chac.common.checks import check_action_space, check_integer
-from sb3_chac.human.experts import Expert, check_expert, expert_name, make_expert
+from sb3_chac.common.arguments import checked
+from sb3_chac.common.checks import check_action_space, check_integer, check_range
+from sb3_chac.human.experts import Expert, check_expert, expert_name, make_expert, within
 from sb3_chac.human.rules import TakeoverRule, check_rule, make_rule, scale_action
 
 
 class ExpertError(RuntimeError):
     """Raised when the expert fails or hands in something that is no action. The environment has not made the step."""
+
+
+class RuleError(RuntimeError):
+    """Raised when the rule fails or does not say who drives. The environment has not made the step."""
 
 
 class ControlState(StrEnum):
@@ -72,11 +77,15 @@ class InterventionWrapper(contract.TakeoverWrapper, RecordConstructorArgs):
     :param budget: how many steps the human drives at most, over all episodes, None for no limit. Among the copies of an
         environment that an algorithm trains in, it is shared
     :param armed: whether to arm it at once
+    :param deadline: seconds that the expert and the rule have for each answer, None for as long as they need. With one, they
+        are asked in a thread of their own, which is left to itself if it is late
     :param rule_kwargs: of the rule if it is "risk" (e.g. ``{"take_over_below": 1.8}``, see ``RiskRule``) or "disagreement"
     :raises ValueError: for an argument that does not fit; while armed, for an action that is not finite or of another shape
-    :raises ExpertError: from ``reset``, ``step`` and ``arm`` when the expert fails
+    :raises ExpertError: from ``reset``, ``step`` and ``arm`` when the expert fails or is late
+    :raises RuleError: likewise, of the rule
     """
 
+    @checked
     def __init__(
         self,
         env: gym.Env,
@@ -85,10 +94,18 @@ class InterventionWrapper(contract.TakeoverWrapper, RecordConstructorArgs):
         budget: int | None = None,
         armed: bool = False,
         rule_kwargs: dict[str, Any] | None = None,
+        deadline: float | None = None,
     ):
         # Not copied: a model may hold a replay buffer or subprocesses
         RecordConstructorArgs.__init__(
-            self, _disable_deepcopy=True, expert=expert, rule=rule, budget=budget, armed=armed, rule_kwargs=rule_kwargs
+            self,
+            _disable_deepcopy=True,
+            expert=expert,
+            rule=rule,
+            budget=budget,
+            armed=armed,
+            rule_kwargs=rule_kwargs,
+            deadline=deadline,
         )
         gym.Wrapper.__init__(self, env)
         check_action_space(env.action_space)
@@ -97,7 +114,9 @@ class InterventionWrapper(contract.TakeoverWrapper, RecordConstructorArgs):
         check_rule(rule, expert, rule_kwargs)
         if budget is not None:
             check_integer("budget", budget, low=0)
-        self.budget = budget
+        if deadline is not None:
+            check_range("deadline", deadline, low=0.0, exclusive_low=True)
+        self.budget, self.deadline = budget, deadline
         self._expert_argument, self._rule_arguments = expert, (rule, rule_kwargs)
         self._rule_in_force = self._rule_arguments
         self._expert: Expert | None = None  # both are built when first armed
@@ -347,10 +366,13 @@ class InterventionWrapper(contract.TakeoverWrapper, RecordConstructorArgs):
         assert self._expert is not None and self._rule is not None
         observation, self._observation = self._observation, None  # stays None if anything fails
         try:
-            self._expert.reset(seed=self._seed)
+            within(self.deadline, self._expert.reset, seed=self._seed)
         except Exception as error:
             raise self._expert_error(f"raised {type(error).__name__} in its reset: {error}.") from error
-        self._rule.reset()
+        try:
+            within(self.deadline, self._rule.reset)
+        except Exception as error:
+            raise self._rule_error(f"raised {type(error).__name__} in its reset: {error}.") from error
         self._observation, self._seed = observation, None
 
     def _ask_expert(self, observation: Any) -> np.ndarray:
@@ -359,7 +381,7 @@ class InterventionWrapper(contract.TakeoverWrapper, RecordConstructorArgs):
         """
         assert self._expert is not None
         try:
-            values = np.array(self._expert(copy.deepcopy(observation)), dtype=np.float64)
+            values = np.array(within(self.deadline, self._expert, copy.deepcopy(observation)), dtype=np.float64)
         except Exception as error:
             raise self._expert_error(f"raised {type(error).__name__}: {error}.") from error
         low, high = self._box.low.astype(np.float64), self._box.high.astype(np.float64)
@@ -383,10 +405,22 @@ class InterventionWrapper(contract.TakeoverWrapper, RecordConstructorArgs):
     def _ask_rule(self, observation: Any, novice_action: np.ndarray, expert_action: np.ndarray, was_driving: bool) -> bool:
         assert self._rule is not None
         # Copies: it may keep or change what it is given
-        takeover = self._rule(copy.deepcopy(observation), novice_action.copy(), expert_action.copy(), was_driving)
+        asked = copy.deepcopy(observation), novice_action.copy(), expert_action.copy(), was_driving
+        try:
+            takeover = within(self.deadline, self._rule, *asked)
+        except Exception as error:
+            raise self._rule_error(f"raised {type(error).__name__}: {error}.") from error
         if not isinstance(takeover, bool | np.bool_):
-            raise TypeError(f"rule must return True or False, got {takeover!r} from {self._rule_in_force[0]!r}.")
+            raise self._rule_error(f"must return True or False, got {takeover!r}.")
         return bool(takeover)
+
+    def _rule_error(self, problem: str) -> RuleError:
+        rule = self._rule_in_force[0]
+        name = repr(rule) if isinstance(rule, str) else getattr(rule, "__qualname__", type(rule).__name__)
+        return RuleError(
+            f"The rule {name} {problem} The environment did not make a step. Mend the rule or pass another as rule=..., and "
+            "go on with reset()."
+        )
 
     def _checked_novice_action(self, action: Any) -> np.ndarray:
         if self._observation is None:

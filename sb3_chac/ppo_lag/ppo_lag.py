@@ -13,6 +13,7 @@ from stable_baselines3.common.utils import explained_variance, obs_as_tensor
 from stable_baselines3.common.vec_env import VecEnv
 from torch.nn import functional as F
 
+from sb3_chac.common.arguments import checked
 from sb3_chac.common.checked_rollouts import CheckedRollouts
 from sb3_chac.common.checks import check_learning_rate, check_range
 from sb3_chac.common.lagrange import CostConstrainedAlgorithm, constrained_advantages
@@ -96,6 +97,7 @@ class PPOLag(CostConstrainedAlgorithm, CheckedRollouts, PPO):
     policy: CostActorCriticPolicy
     rollout_buffer: CostRolloutBuffer
 
+    @checked
     def __init__(
         self,
         policy: str | type[CostActorCriticPolicy],

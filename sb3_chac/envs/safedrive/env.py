@@ -9,7 +9,8 @@ import numpy as np
 from gymnasium import spaces
 from highway_env.road.road import Road
 
-from sb3_chac.common.checks import check_integer, check_range
+from sb3_chac.common.arguments import checked
+from sb3_chac.common.checks import check_driving_action, check_integer, check_range
 from sb3_chac.common.contract import TakeoverDisplay
 from sb3_chac.envs.display import STEPS_PER_SECOND
 from sb3_chac.envs.driving.compiled import compiled
@@ -119,6 +120,7 @@ class SafeDriveEnv(gym.Env, TakeoverDisplay):
 
     metadata = {"render_modes": ["rgb_array", "human"], "render_fps": STEPS_PER_SECOND}  # noqa: RUF012
 
+    @checked
     def __init__(
         self,
         start_scenario: int = 100,
@@ -229,6 +231,7 @@ class SafeDriveEnv(gym.Env, TakeoverDisplay):
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         ego = self.ego
+        check_driving_action(action)
         action = np.clip(np.asarray(action, dtype=float), -1.0, 1.0)
         before = Pose(ego.position[0], ego.position[1], ego.heading)
         ego.control(action[0], action[1])
