@@ -84,7 +84,8 @@ def annotations(init: Callable[..., None]) -> dict[str, Any]:
     """
     :return: those of the arguments, by name
     """
-    return typing.get_type_hints(init, localns={"VecEnv": VecEnv})  # SB3's GymEnv names it
+    # SB3's GymEnv names the first, a Dataset of demonstrations the others, which say themselves what is wrong with one
+    return typing.get_type_hints(init, localns={"VecEnv": VecEnv, "Demonstrations": Any, "MinariDataset": Any})
 
 
 def check_argument(name: str, value: Any, hint: Any) -> None:

@@ -205,7 +205,7 @@ class DualReplayBuffer(ReplayBuffer):
                 "done": done[idx] and not is_timeout,
                 "takeover": bool(info.get(TAKEOVER, False)),
                 "takeover_start": bool(info.get(TAKEOVER_START, False)),
-                "cost": float(info.get("cost", 0.0)),
+                "cost": float(info.get("cost") or 0.0),  # None: not measured
             }
             if self.n_steps == 1:
                 self._append(row)
