@@ -8,6 +8,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
+from test_zoo import swings
 
 import sb3_chac
 from sb3_chac.common.arguments import RANGES, annotations, fits
@@ -103,8 +104,10 @@ def test_what_signatures_say_is_what_the_defaults_are(owner):
 @pytest.mark.parametrize("name", ["clip_range", "clip_range_vf", "learning_rate"])
 @pytest.mark.parametrize("algorithm", [sb3_chac.PPOLag, sb3_chac.GAIL])
 def test_schedules_are_looked_into(algorithm, name, schedule, is_good):
+    dataset = {"dataset": swings()} if algorithm is sb3_chac.GAIL else {}
+
     def make():
-        return algorithm("MlpPolicy", "Pendulum-v1", **{name: schedule})
+        return algorithm("MlpPolicy", "Pendulum-v1", **dataset, **{name: schedule})
 
     if is_good:
         make()
