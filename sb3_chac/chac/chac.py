@@ -10,10 +10,10 @@ from stable_baselines3.sac.policies import Actor
 
 from sb3_chac.chac.policies import CONTROLS, CHACPolicy, CnnPolicy, MlpPolicy, MultiInputPolicy
 from sb3_chac.common.arguments import checked
-from sb3_chac.common.buffers import DualReplayBuffer, DualReplayBufferSamples, take_rows
+from sb3_chac.common.buffers import DualReplayBuffer, DualReplayBufferSamples
 from sb3_chac.common.checks import check_integer, check_range
 from sb3_chac.common.critics import DistributionalCritic
-from sb3_chac.common.distributional import gaussian_surrogate_loss, return_targets
+from sb3_chac.common.distributional import return_targets
 from sb3_chac.common.utils import TargetUpdate, minimize
 from sb3_chac.dpvp.dpvp import DPVP
 
@@ -53,8 +53,6 @@ class CHAC(DPVP):
       scale of a task's reward.
     - The return hardly shows a collision (5 of 370 on SafeDrive): the safety cost is subtracted from the reward that Z_c
       learns (``cost_coef``).
-    - In stage 1 nothing bad happens, since the human takes over before: Z_c would first learn in stage 2, by accidents, what
-      they cost. It is told: what the novice proposed where the human took over counts as ``takeover_cost`` of an accident.
 
     ``preset`` fills in the arguments that are None, those of ``DPVP`` and:
 
@@ -69,7 +67,6 @@ class CHAC(DPVP):
     anchor_coef         20          0
     normalize_rewards   True        False
     cost_coef           60          0
-    takeover_cost       0.0         0
     ==================  ==========  =======
 
     The parameters are those of ``DPVP``, and:
@@ -91,7 +88,6 @@ class CHAC(DPVP):
         in units of what Z_c learns
     :param normalize_rewards: whether Z_c learns rewards in units of their running root mean square
     :param cost_coef: what ``info["cost"]`` counts against (normalised) rewards in Z_c
-    :param takeover_cost: safety cost of the novice's action where the human drives, in Z_c; 0 leaves these labels out
     :raises ValueError: for an argument out of its range, an action space that is not a bounded Box, or, while learning,
         an observation or reward that is NaN or infinite
     """
@@ -107,11 +103,10 @@ class CHAC(DPVP):
             "anchor_coef": 20.0,
             "normalize_rewards": True,
             "cost_coef": 60.0,
-            "takeover_cost": 0.0,
         },
         "paper": DPVP.presets["paper"]
         | {"sigma_scale": 1.0, "prefit_steps": 0, "bootstrap": "self", "stage2_human_share": 0.0, "anchor_coef": 0.0}
-        | {"normalize_rewards": False, "cost_coef": 0.0, "takeover_cost": 0.0},
+        | {"normalize_rewards": False, "cost_coef": 0.0},
     }
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
         "MlpPolicy": MlpPolicy,
@@ -173,7 +168,6 @@ class CHAC(DPVP):
         anchor_coef: float | None = None,
         normalize_rewards: bool | None = None,
         cost_coef: float | None = None,
-        takeover_cost: float | None = None,
         use_sde: bool = False,
         sde_sample_freq: int = -1,
         use_sde_at_warmup: bool = False,
@@ -243,7 +237,6 @@ class CHAC(DPVP):
         self.anchor_coef: Any = anchor_coef
         self.normalize_rewards: Any = normalize_rewards
         self.cost_coef: Any = cost_coef
-        self.takeover_cost: Any = takeover_cost
 
         if _init_setup_model:
             self._setup_model()
@@ -283,7 +276,6 @@ class CHAC(DPVP):
         check_range("stage2_human_share", self.stage2_human_share, low=0.0, high=1.0)
         check_range("anchor_coef", self.anchor_coef, low=0.0)
         check_range("cost_coef", self.cost_coef, low=0.0)
-        check_range("takeover_cost", self.takeover_cost, low=0.0)
         if self.bootstrap not in ("executed", "self"):
             raise ValueError(f"bootstrap must be 'executed' or 'self', got {self.bootstrap!r}.")
 
@@ -340,19 +332,7 @@ class CHAC(DPVP):
         else:
             targets = self._shared_return_targets(batch, rewards, ent_coef)
         losses, _, stats = self._critic_losses(self.confidence_critic, batch, targets, self.eta_c)
-        loss = losses.mean(dim=1).sum()
-        human = batch.takeovers.flatten().nonzero().flatten()
-        if self.takeover_cost > 0 and len(human) > 0:
-            penalty = self.cost_coef * self.takeover_cost
-            q_novice, std_novice = self.confidence_critic(take_rows(batch.observations, human), batch.novice_actions[human])
-            differ = (batch.actions - batch.novice_actions)[human].square().mean(dim=1).sqrt() >= self.pv_min_diff
-            mean_targets, sampled_targets = (target[human] - penalty for target in targets)
-            eta = self.eta if self.eta_c is None else self.eta_c
-            labels = gaussian_surrogate_loss(
-                q_novice, std_novice, mean_targets, sampled_targets, self.confidence_critic.mean_std, eta
-            )
-            loss = loss + (labels * differ).sum() / len(batch.takeovers)
-        minimize(loss, self.confidence_critic.optimizer)
+        minimize(losses.mean(dim=1).sum(), self.confidence_critic.optimizer)
         self.confidence_update(self.tau if self.tau_c is None else self.tau_c)
         return {f"confidence_{name}": value for name, value in stats.items()}
 
