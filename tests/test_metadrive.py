@@ -414,3 +414,11 @@ def test_the_installation_is_left_as_it_was():
     code = "from sb3_chac.envs.metadrive import MetaDriveSafetyEnv as E; e = E(headless=True); e.reset(); e.close()"
     subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
     assert {path for path in package.rglob("*") if "__pycache__" not in path.parts} == before
+
+
+@pytest.mark.parametrize("action", [[np.nan, 0], [0, np.inf], [0], "left"])
+def test_actions_that_are_none_do_not_move_the_car(env, action):
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match=r"^action must be two finite numbers.*did not make a step"):
+        env.step(action)
+    assert env.steps == 0

@@ -11,7 +11,9 @@ from stable_baselines3.common.buffers import BaseBuffer, ReplayBuffer
 from stable_baselines3.common.type_aliases import TensorDict
 from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_chac.common.arguments import checked
 from sb3_chac.common.checks import check_integer, check_range
+from sb3_chac.common.contract import NOVICE_ACTION, TAKEOVER, TAKEOVER_START
 
 Observation = np.ndarray | dict[str, np.ndarray]
 # Columns of a store with one number a row
@@ -120,6 +122,7 @@ class DualReplayBuffer(ReplayBuffer):
     :raises ValueError: for an argument that does not fit
     """
 
+    @checked
     def __init__(
         self,
         buffer_size: int,
@@ -196,13 +199,13 @@ class DualReplayBuffer(ReplayBuffer):
                 **self._entries("observation", obs, idx),
                 **self._entries("next_observation", next_obs, idx),
                 "action": np.ravel(action[idx]),
-                "novice_action": np.ravel(info.get("novice_action", action[idx])),
+                "novice_action": np.ravel(info.get(NOVICE_ACTION, action[idx])),
                 "reward": reward[idx],
                 "discount": self.gamma,
                 "done": done[idx] and not is_timeout,
-                "takeover": bool(info.get("takeover", False)),
-                "takeover_start": bool(info.get("takeover_start", False)),
-                "cost": float(info.get("cost", 0.0)),
+                "takeover": bool(info.get(TAKEOVER, False)),
+                "takeover_start": bool(info.get(TAKEOVER_START, False)),
+                "cost": float(info.get("cost") or 0.0),  # None: not measured
             }
             if self.n_steps == 1:
                 self._append(row)

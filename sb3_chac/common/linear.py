@@ -28,6 +28,16 @@ USE_ONEDNN = th.backends.mkldnn.is_available() and hasattr(th.ops.mkldnn, "_line
 MIN_BATCH_SIZE = 32
 
 
+def is_traced() -> bool:
+    """Whether torch records what is computed (TorchScript, ONNX, ``torch.export``), to run it elsewhere."""
+    return th.jit.is_tracing() or th.compiler.is_compiling()
+
+
+def uses_onednn() -> bool:
+    """Whether to take the detour."""
+    return USE_ONEDNN and not is_traced()
+
+
 class OneDnnLinearFunction(th.autograd.Function):
     """``inputs @ weight.t() + bias`` and its gradients, for float32 matrices on the CPU."""
 
@@ -59,7 +69,7 @@ def linear(inputs: th.Tensor, weight: th.Tensor, bias: th.Tensor) -> th.Tensor:
     :return: ``inputs @ weight.t() + bias``, shape (batch_size, out_features)
     """
     is_float_matrix = inputs.dim() == 2 and inputs.dtype == weight.dtype == th.float32
-    if USE_ONEDNN and is_float_matrix and inputs.device.type == "cpu" and len(inputs) >= MIN_BATCH_SIZE:
+    if uses_onednn() and is_float_matrix and inputs.device.type == "cpu" and len(inputs) >= MIN_BATCH_SIZE:
         return OneDnnLinearFunction.apply(inputs, weight, bias)
     return nn.functional.linear(inputs, weight, bias)
 
@@ -93,7 +103,7 @@ class StackedLinear(nn.Module):
         :param inputs: shape (n_stack, batch_size, in_features)
         :return: shape (n_stack, batch_size, out_features)
         """
-        if USE_ONEDNN and inputs.device.type == "cpu":
+        if uses_onednn() and inputs.device.type == "cpu":
             return th.stack([linear(*layer) for layer in zip(inputs, self.weight, self.bias, strict=True)])
         return th.baddbmm(self.bias.unsqueeze(1), inputs, self.weight.transpose(1, 2))
 

@@ -7,7 +7,9 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from sb3_chac.common.checks import check_integer, check_range
+from sb3_chac.common.arguments import checked
+from sb3_chac.common.checks import check_driving_action, check_integer, check_range
+from sb3_chac.common.contract import TakeoverDisplay
 from sb3_chac.envs.display import STEPS_PER_SECOND
 from sb3_chac.envs.driving.corridors import FAR, LATERALS, N_CORRIDORS, N_VIEW, ROUTE_SPACING, CorridorView, route_along
 from sb3_chac.envs.metadrive.drivers import DRIVERS
@@ -53,7 +55,7 @@ PRESETS = {
 }
 
 
-class MetaDriveSafetyEnv(gym.Env):
+class MetaDriveSafetyEnv(gym.Env, TakeoverDisplay):
     """
     MetaDrive's SafeMetaDriveEnv: drive through seeded maps of three blocks among traffic, cones, warning triangles, barriers
     and broken-down vehicles; ten decisions per second. One environment per process (see ``EngineInUse``).
@@ -128,6 +130,7 @@ class MetaDriveSafetyEnv(gym.Env):
 
     metadata = {"render_modes": ["rgb_array", "human"], "render_fps": STEPS_PER_SECOND}  # noqa: RUF012
 
+    @checked
     def __init__(
         self,
         preset: str = "chac",
@@ -213,6 +216,7 @@ class MetaDriveSafetyEnv(gym.Env):
         return self._observed(observation), info
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        check_driving_action(action)
         steering, throttle = np.clip(np.asarray(action, dtype=float), -1.0, 1.0)
         throttle = max(throttle, -max(self.forward_speed, 0.0) / FULL_BRAKE)
         observation, reward, terminated, truncated, info = self.simulator.step([steering, throttle])

@@ -9,7 +9,9 @@ import numpy as np
 from gymnasium import spaces
 from highway_env.road.road import Road
 
-from sb3_chac.common.checks import check_integer, check_range
+from sb3_chac.common.arguments import checked
+from sb3_chac.common.checks import check_driving_action, check_integer, check_range
+from sb3_chac.common.contract import TakeoverDisplay
 from sb3_chac.envs.display import STEPS_PER_SECOND
 from sb3_chac.envs.driving.compiled import compiled
 from sb3_chac.envs.driving.corridors import N_VIEW, ROUTE_SPACING, CorridorView, route_along
@@ -46,7 +48,7 @@ class Scene(NamedTuple):
     obstacle_sizes: np.ndarray  # length and width
 
 
-class SafeDriveEnv(gym.Env):
+class SafeDriveEnv(gym.Env, TakeoverDisplay):
     """
     Drive a route through seeded maps of straights, curves, ramps, roundabouts, T-intersections and intersections, among
     traffic, cones, warning triangles and parked vehicles; ten decisions per second.
@@ -118,6 +120,7 @@ class SafeDriveEnv(gym.Env):
 
     metadata = {"render_modes": ["rgb_array", "human"], "render_fps": STEPS_PER_SECOND}  # noqa: RUF012
 
+    @checked
     def __init__(
         self,
         start_scenario: int = 100,
@@ -170,8 +173,8 @@ class SafeDriveEnv(gym.Env):
         self.action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
         self.lidar = Lidar()
         self._corridors = CorridorView(self.lidar.rays, self.lidar.reach) if corridors else None
-        n_observation = N_STATE + self.lidar.rays + N_VIEW * corridors
-        self.observation_space = spaces.Box(-1.0, 1.0, (n_observation,), np.float32)
+        self._n_observation = N_STATE + self.lidar.rays + N_VIEW * corridors
+        self.observation_space = spaces.Box(-1.0, 1.0, (self._n_observation,), np.float32)
         self._scenes: OrderedDict[int, Scene] = OrderedDict()
         self._viewer: Any = None
 
@@ -228,6 +231,7 @@ class SafeDriveEnv(gym.Env):
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         ego = self.ego
+        check_driving_action(action)
         action = np.clip(np.asarray(action, dtype=float), -1.0, 1.0)
         before = Pose(ego.position[0], ego.position[1], ego.heading)
         ego.control(action[0], action[1])
@@ -315,7 +319,7 @@ class SafeDriveEnv(gym.Env):
     def _observe(self) -> np.ndarray:
         ego, route = self.ego, self.map.route
         distances, self.seen = self.scan()
-        observation = np.empty(self.observation_space.shape, np.float32)
+        observation = np.empty(self._n_observation, np.float32)
         off_lane = self.lateral - LANES[int(self.lateral > 0)]
         observation[:N_EGO] = (
             self.lateral / HALF_WIDTH, -self.lateral / HALF_WIDTH, math.tanh(self.heading_error / 0.15),
