@@ -85,7 +85,10 @@ class Served:
 
 
 @pytest.fixture
-def served(tmp_path):
+def served(tmp_path, monkeypatch, request):
+    """Nobody is dropped because the machine is slow, unless the parameter says after how many seconds."""
+    monkeypatch.setattr(server_module, "HEARTBEAT", None)
+    monkeypatch.setattr(server_module, "PATIENCE", getattr(request, "param", FOREVER))
     drive = Served(tmp_path)
     yield drive
     drive.stop()
@@ -446,9 +449,8 @@ def test_too_many_viewers(served):
     asyncio.run(crowd())
 
 
-def test_a_flood_of_connections(served, monkeypatch):
-    monkeypatch.setattr(server_module, "PATIENCE", 1.0)
-
+@pytest.mark.parametrize("served", [1.0], indirect=True)
+def test_a_flood_of_connections(served):
     async def flood():
         async with driving(served):
             address = ("127.0.0.1", served.server.address.port)

@@ -42,6 +42,7 @@ MOST_REMARKS = 10  # in the log in a second
 MOST_VIEWERS = 16
 MOST_CONNECTIONS = 64
 PATIENCE = 10.0  # [s] with a connection that asks for nothing
+HEARTBEAT = 5.0  # [s] between two questions whether a viewer is still there
 HOST = re.compile(r"(\[[0-9a-fA-F:.]+\]|[0-9a-zA-Z._-]+)(:[0-9]{1,5})?")
 LOOK, TELL = 0.01, 0.05  # [s] between two looks for a new picture, and between two messages to a viewer at most
 HEADERS = {
@@ -243,7 +244,9 @@ class Server:
         if len(self.viewers) >= MOST_VIEWERS:
             raise web.HTTPServiceUnavailable(text=f"There are {MOST_VIEWERS} viewers already.")
         # Without autoping, control frames come as messages and are counted
-        channel = web.WebSocketResponse(max_msg_size=MOST_BYTES, heartbeat=5.0, compress=False, timeout=1.0, autoping=False)
+        channel = web.WebSocketResponse(
+            max_msg_size=MOST_BYTES, heartbeat=HEARTBEAT, compress=False, timeout=1.0, autoping=False
+        )
         viewer = Viewer(channel, may_drive)
         self.viewers.append(viewer)
         telling = None
