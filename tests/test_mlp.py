@@ -5,12 +5,13 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.distributions import SquashedDiagGaussianDistribution
 from stable_baselines3.common.logger import configure
 from torch import nn
 
 from sb3_chac import CHAC, DPVP, DSAC
+from sb3_chac.common import actors, mlp
 from sb3_chac.common import linear as linear_module
-from sb3_chac.common import mlp
 from sb3_chac.common.linear import StackedLinear
 from sb3_chac.common.mlp import FastMLP, use_fast_mlps
 
@@ -75,6 +76,18 @@ def test_other_architectures_stay_what_they_are(others) -> None:
     assert type(sequential) is nn.Sequential
 
 
+def test_samples_and_likelihoods_are_those_of_sb3() -> None:
+    mean, log_std = th.randn(256, 2, requires_grad=True), th.linspace(-5, 1, 512).view(256, 2).requires_grad_()
+    weights, results = th.randn(256, 2), []
+    for distribution in (SquashedDiagGaussianDistribution(2), actors.FastSquashedGaussian(2)):
+        th.manual_seed(0)
+        action, log_prob = distribution.log_prob_from_params(mean, log_std)
+        objective = (action * weights).sum() + (log_prob * weights[:, 0]).sum()
+        results.append((action, log_prob, *th.autograd.grad(objective, (mean, log_std))))
+    for ours, theirs in zip(*results, strict=True):
+        th.testing.assert_close(ours, theirs, atol=1e-3, rtol=1e-4)
+
+
 class Spaces(gym.Env):
     """Only there for its spaces."""
 
@@ -104,6 +117,7 @@ def trained(algorithm, **kwargs):
 def test_the_ordinary_path_learns_the_same(algorithm, kwargs, activation_fn, monkeypatch) -> None:
     fast = trained(algorithm, activation_fn=activation_fn, **kwargs)
     monkeypatch.setattr(mlp, "is_covered", lambda module: False)
+    monkeypatch.setattr(actors, "FastSquashedGaussian", SquashedDiagGaussianDistribution)
     ordinary = trained(algorithm, activation_fn=activation_fn, **kwargs)
     assert any(type(module) is FastMLP for module in fast.policy.modules())
     assert not any(type(module) is FastMLP for module in ordinary.policy.modules())

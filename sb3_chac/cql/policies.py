@@ -7,6 +7,7 @@ from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.sac.policies import Actor, SACPolicy
 from torch import nn
 
+from sb3_chac.common.actors import use_fast_actor
 from sb3_chac.common.mlp import use_fast_mlps
 
 
@@ -24,7 +25,7 @@ class CQLPolicy(SACPolicy):
 
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Actor:
         actor = super().make_actor(features_extractor)
-        use_fast_mlps(actor)
+        use_fast_actor(actor)
         return actor
 
     def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> ContinuousCritic:
