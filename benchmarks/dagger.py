@@ -95,14 +95,14 @@ def main() -> None:
                 optimizer.zero_grad()
                 loss.backward()
                 optimizer.step()
-        success, cost, total, completion = episodes.mean(axis=0)
+        success, cost, total, completion = episodes.mean(axis=0).tolist()
         print(
             f"{len(data_x)} labels, loss {loss.item():.4f}, while learning: success {success:.2f} cost {cost:.2f}", flush=True
         )
         if last or len(data_x) // args.every > (len(data_x) - len(x)) // args.every:
             tests = range(args.test, args.test + args.episodes)
             _, _, episodes = drive(env, policy, expert, tests, rng)
-            success, cost, total, completion = episodes.mean(axis=0)
+            success, cost, total, completion = episodes.mean(axis=0).tolist()
             row = {
                 "env": args.env,
                 "corridors": args.corridors,
