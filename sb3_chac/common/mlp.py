@@ -107,7 +107,7 @@ def _networks(parameters: tuple[th.Tensor, ...]) -> list[list[tuple[th.Tensor, t
     layers = list(zip(parameters[::2], parameters[1::2], strict=True))
     if parameters[0].dim() == 2:
         return [layers]
-    return list(zip(*(zip(weight, bias, strict=True) for weight, bias in layers), strict=True))  # type: ignore[arg-type]
+    return list(zip(*(zip(weight, bias, strict=True) for weight, bias in layers), strict=True))
 
 
 def _sum(tensors: list[th.Tensor]) -> th.Tensor | None:
