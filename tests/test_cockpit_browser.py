@@ -425,7 +425,7 @@ def test_who_is_refused_or_dropped_is_logged_without_a_token(served, caplog):
         async with driving(served), served.viewer() as channel:
             await channel.send_str("{")
             await closed(channel)
-            await until(lambda: "dropped a viewer" in caplog.text)
+            await until(lambda: "dropped the viewer at 127.0.0.1: no JSON" in caplog.text)
         assert "refused '/'" in caplog.text and token not in caplog.text
 
     asyncio.run(come())

@@ -62,10 +62,11 @@ class Viewer:
     One page that is open.
 
     :param may_drive: whether it may take the wheel
+    :param remote: its address
     """
 
-    def __init__(self, socket: web.WebSocketResponse, may_drive: bool) -> None:
-        self.socket, self.may_drive = socket, may_drive
+    def __init__(self, socket: web.WebSocketResponse, may_drive: bool, remote: str | None) -> None:
+        self.socket, self.may_drive, self.remote = socket, may_drive, remote
         self.news = asyncio.Event()
         self.shown = -1  # number of the newest picture it was sent
 
@@ -247,7 +248,7 @@ class Server:
         channel = web.WebSocketResponse(
             max_msg_size=MOST_BYTES, heartbeat=HEARTBEAT, compress=False, timeout=1.0, autoping=False
         )
-        viewer = Viewer(channel, may_drive)
+        viewer = Viewer(channel, may_drive, request.remote)
         self.viewers.append(viewer)
         telling = None
         try:
@@ -259,8 +260,8 @@ class Server:
             if telling is not None:
                 telling.cancel()
             self.viewers.remove(viewer)
-            if channel.close_code not in (None, WSCloseCode.OK, WSCloseCode.GOING_AWAY):
-                self._remark(f"dropped a viewer at {request.remote}: code {channel.close_code}")
+            if channel.close_code == WSCloseCode.ABNORMAL_CLOSURE:
+                self._remark(f"lost the viewer at {viewer.remote}")
             if self.driver is viewer:
                 self.driver = None
                 with self.drive.person.lock:
@@ -291,6 +292,7 @@ class Server:
                     raise BadMessage("not text")
                 await self._obey(viewer, parse(message.data))
             except BadMessage as error:
+                self._remark(f"dropped the viewer at {viewer.remote}: {error}")
                 await viewer.socket.close(code=WSCloseCode.POLICY_VIOLATION, message=str(error).encode())
                 return
 
