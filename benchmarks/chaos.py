@@ -273,7 +273,7 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--kills", type=int, default=12, metavar="N", help="(default: %(default)s)")
     parser.add_argument("--steps", type=int, default=1200, metavar="N", help="of the training (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=0, help="(default: %(default)s)")
-    parser.add_argument("--disk", type=int, default=4, metavar="MB", help="size of the disk, 0 for no such test (%(default)s)")
+    parser.add_argument("--disk", type=int, default=16, metavar="MB", help="size of the disk, 0: no such test (%(default)s)")
     parser.add_argument("--inside", type=Path, help=argparse.SUPPRESS)
     args = parser.parse_args(arguments)
     if args.inside:

@@ -18,8 +18,8 @@ from sb3_chac.envs.driving.corridors import (
 from sb3_chac.envs.safedrive import SafeDriveEnv
 from sb3_chac.envs.safedrive import traffic as t
 from sb3_chac.envs.safedrive.driver import ScriptedDriver
-from sb3_chac.envs.safedrive.env import CHECKPOINTS, N_STATE, route_ahead
 from sb3_chac.envs.safedrive.geometry import wrap_angle
+from sb3_chac.envs.safedrive.navigation import CHECKPOINTS, N_EGO, N_STATE, route_ahead
 
 
 @pytest.fixture(scope="module", params=[(0.6, 0.3), (3.0, 1.0)], ids=["usual", "dense"])
@@ -65,6 +65,14 @@ def plain_route(observation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate([[beside], beside + np.cumsum((directions[1:] + directions[:-1]) / 2, axis=0)]), headings
 
 
+def plain_navigation(env: SafeDriveEnv) -> np.ndarray:
+    route, ego = env.map.route, env.ego
+    points = route[np.minimum(((env.s + CHECKPOINTS) / 0.5).astype(int), len(route) - 1)]
+    bearings = np.arctan2(points[:, 1] - ego.position[1], points[:, 0] - ego.position[0]) - ego.heading
+    headings = points[:, 2] - ego.heading
+    return np.stack([np.tanh(wrap_angle(bearings) / 0.4), np.tanh(wrap_angle(headings) / 0.6)], axis=1).ravel()
+
+
 def plain_corridors(closeness: np.ndarray, route: np.ndarray, headings: np.ndarray) -> np.ndarray:
     angles = np.arange(len(closeness)) * 2 * np.pi / len(closeness)
     hit = (np.cos(angles) > 1e-9) & (closeness > 1e-4)
@@ -94,10 +102,11 @@ def test_lidar(env: SafeDriveEnv) -> None:
         np.testing.assert_array_equal(seen, expected_seen)
 
 
-def test_route_and_corridors(env: SafeDriveEnv) -> None:
+def test_the_way_ahead(env: SafeDriveEnv) -> None:
     corridors = Corridors(env.lidar.rays, env.lidar.reach)
     closed = 0
     for observation in situations(env):
+        np.testing.assert_allclose(observation[N_EGO:N_STATE], plain_navigation(env), atol=1e-6)
         lidar = observation[N_STATE : N_STATE + env.lidar.rays]
         route, headings = route_ahead(observation)
         expected_route, expected_headings = plain_route(observation)

@@ -18,7 +18,7 @@ from sb3_chac.envs.driving.corridors import (
     Corridors,
     CorridorView,
 )
-from sb3_chac.envs.safedrive.env import route_ahead
+from sb3_chac.envs.safedrive.navigation import route_ahead
 
 RAYS, REACH = 240, 50.0
 STRAIGHT = np.stack([np.arange(51.0), np.zeros(51)], axis=1), np.zeros(51)

@@ -42,6 +42,7 @@ MOST_REMARKS = 10  # in the log in a second
 MOST_VIEWERS = 16
 MOST_CONNECTIONS = 64
 PATIENCE = 10.0  # [s] with a connection that asks for nothing
+HEARTBEAT = 5.0  # [s] between two questions whether a viewer is still there
 HOST = re.compile(r"(\[[0-9a-fA-F:.]+\]|[0-9a-zA-Z._-]+)(:[0-9]{1,5})?")
 LOOK, TELL = 0.01, 0.05  # [s] between two looks for a new picture, and between two messages to a viewer at most
 HEADERS = {
@@ -61,10 +62,11 @@ class Viewer:
     One page that is open.
 
     :param may_drive: whether it may take the wheel
+    :param remote: its address
     """
 
-    def __init__(self, socket: web.WebSocketResponse, may_drive: bool) -> None:
-        self.socket, self.may_drive = socket, may_drive
+    def __init__(self, socket: web.WebSocketResponse, may_drive: bool, remote: str | None) -> None:
+        self.socket, self.may_drive, self.remote = socket, may_drive, remote
         self.news = asyncio.Event()
         self.shown = -1  # number of the newest picture it was sent
 
@@ -243,8 +245,10 @@ class Server:
         if len(self.viewers) >= MOST_VIEWERS:
             raise web.HTTPServiceUnavailable(text=f"There are {MOST_VIEWERS} viewers already.")
         # Without autoping, control frames come as messages and are counted
-        channel = web.WebSocketResponse(max_msg_size=MOST_BYTES, heartbeat=5.0, compress=False, timeout=1.0, autoping=False)
-        viewer = Viewer(channel, may_drive)
+        channel = web.WebSocketResponse(
+            max_msg_size=MOST_BYTES, heartbeat=HEARTBEAT, compress=False, timeout=1.0, autoping=False
+        )
+        viewer = Viewer(channel, may_drive, request.remote)
         self.viewers.append(viewer)
         telling = None
         try:
@@ -256,8 +260,8 @@ class Server:
             if telling is not None:
                 telling.cancel()
             self.viewers.remove(viewer)
-            if channel.close_code not in (None, WSCloseCode.OK, WSCloseCode.GOING_AWAY):
-                self._remark(f"dropped a viewer at {request.remote}: code {channel.close_code}")
+            if channel.close_code == WSCloseCode.ABNORMAL_CLOSURE:
+                self._remark(f"lost the viewer at {viewer.remote}")
             if self.driver is viewer:
                 self.driver = None
                 with self.drive.person.lock:
@@ -288,6 +292,7 @@ class Server:
                     raise BadMessage("not text")
                 await self._obey(viewer, parse(message.data))
             except BadMessage as error:
+                self._remark(f"dropped the viewer at {viewer.remote}: {error}")
                 await viewer.socket.close(code=WSCloseCode.POLICY_VIOLATION, message=str(error).encode())
                 return
 

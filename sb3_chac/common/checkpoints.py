@@ -108,7 +108,7 @@ class ResumableCheckpoint(BaseCallback):
         if stopped_by is not None or self.model.num_timesteps >= self.due_at:
             self.save()
         if stopped_by is not None:
-            raise TrainingStopped(stopped_by, self._farewell(signal.Signals(stopped_by).name))
+            raise TrainingStopped(stopped_by, self.farewell(signal.Signals(stopped_by).name))
 
     def _on_step(self) -> bool:
         return True  # too early: the transition is not stored yet
@@ -120,8 +120,9 @@ class ResumableCheckpoint(BaseCallback):
         if self.is_stored and self.model.num_timesteps >= self.model._total_timesteps:
             self.save()
 
-    def _farewell(self, reason: str) -> str:
+    def farewell(self, reason: str) -> str:
         """
+        :param reason: why it stops
         :return: one sentence that says where the training stopped and how it goes on
         """
         step, newest = self.model.num_timesteps, newest_checkpoint(self.folder)

@@ -11,7 +11,8 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 
-from sb3_chac.common.linear import StackedLinear, use_fast_linear
+from sb3_chac.common.linear import StackedLinear
+from sb3_chac.common.mlp import FastMLP, use_fast_mlps
 
 # Keeps sigma positive where softplus underflows
 MIN_STD = 1e-6
@@ -60,7 +61,7 @@ class DistributionalCritic(BaseModel):
         for in_features, out_features in pairwise(sizes):
             layers += [StackedLinear(n_critics, in_features, out_features), activation_fn()]
         self.z_networks = nn.Sequential(*layers, StackedLinear(n_critics, sizes[-1], 2))
-        use_fast_linear(self.features_extractor)
+        use_fast_mlps(self)
         self.register_buffer("mean_std", th.zeros(n_critics, 1))
 
     def forward(self, obs: PyTorchObs, actions: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
@@ -72,8 +73,11 @@ class DistributionalCritic(BaseModel):
         # A shared extractor is learned by the actor's loss alone (as in SB3's SAC)
         with th.no_grad() if self.share_features_extractor else nullcontext():
             features = self.extract_features(obs, self.features_extractor)
-        inputs = th.cat([features, actions], dim=1).expand(self.n_critics, -1, -1)
-        q_values, raw_stds = self.z_networks(inputs).unbind(dim=2)
+        if isinstance(self.z_networks, FastMLP):
+            outputs = self.z_networks(features, actions)
+        else:
+            outputs = self.z_networks(th.cat([features, actions], dim=1))
+        q_values, raw_stds = outputs.unbind(dim=2)
         return q_values, nn.functional.softplus(raw_stds) + MIN_STD
 
     def pessimistic(self, obs: PyTorchObs, actions: th.Tensor) -> tuple[th.Tensor, th.Tensor]:

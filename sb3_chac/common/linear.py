@@ -38,22 +38,30 @@ def uses_onednn() -> bool:
     return USE_ONEDNN and not is_traced()
 
 
+def takes_onednn(left: th.Tensor, right: th.Tensor) -> bool:
+    """Whether oneDNN computes the product of two matrices."""
+    is_float_matrix = left.dim() == 2 and left.dtype == right.dtype == th.float32
+    return uses_onednn() and is_float_matrix and left.device.type == "cpu" and len(left) >= MIN_BATCH_SIZE
+
+
+def product(left: th.Tensor, right: th.Tensor, bias: th.Tensor | None = None) -> th.Tensor:
+    """``left @ right.t() + bias``, for use where autograd records nothing."""
+    if takes_onednn(left, right):
+        return th.ops.mkldnn._linear_pointwise(left, right, bias, "none", [], "")
+    return nn.functional.linear(left, right, bias)
+
+
 class OneDnnLinearFunction(th.autograd.Function):
     """``inputs @ weight.t() + bias`` and its gradients, for float32 matrices on the CPU."""
 
     @staticmethod
-    def _product(left: th.Tensor, right: th.Tensor, bias: th.Tensor | None = None) -> th.Tensor:
-        return th.ops.mkldnn._linear_pointwise(left, right, bias, "none", [], "")
-
-    @staticmethod
     def forward(ctx: Any, inputs: th.Tensor, weight: th.Tensor, bias: th.Tensor) -> th.Tensor:
         ctx.save_for_backward(inputs, weight)
-        return OneDnnLinearFunction._product(inputs, weight, bias)
+        return product(inputs, weight, bias)
 
     @staticmethod
     def backward(ctx: Any, *grad_outputs: th.Tensor) -> tuple[th.Tensor | None, ...]:
         (inputs, weight), (grad,) = ctx.saved_tensors, grad_outputs
-        product = OneDnnLinearFunction._product
         return (
             product(grad, weight.t()) if ctx.needs_input_grad[0] else None,
             product(grad.t(), inputs.t()) if ctx.needs_input_grad[1] else None,
@@ -68,8 +76,7 @@ def linear(inputs: th.Tensor, weight: th.Tensor, bias: th.Tensor) -> th.Tensor:
     :param bias: shape (out_features,)
     :return: ``inputs @ weight.t() + bias``, shape (batch_size, out_features)
     """
-    is_float_matrix = inputs.dim() == 2 and inputs.dtype == weight.dtype == th.float32
-    if uses_onednn() and is_float_matrix and inputs.device.type == "cpu" and len(inputs) >= MIN_BATCH_SIZE:
+    if takes_onednn(inputs, weight):
         return OneDnnLinearFunction.apply(inputs, weight, bias)
     return nn.functional.linear(inputs, weight, bias)
 
@@ -100,9 +107,10 @@ class StackedLinear(nn.Module):
 
     def forward(self, inputs: th.Tensor) -> th.Tensor:
         """
-        :param inputs: shape (n_stack, batch_size, in_features)
+        :param inputs: shape (n_stack, batch_size, in_features), or (batch_size, in_features) for all layers alike
         :return: shape (n_stack, batch_size, out_features)
         """
+        inputs = inputs.expand(len(self.weight), *inputs.shape[-2:])
         if uses_onednn() and inputs.device.type == "cpu":
             return th.stack([linear(*layer) for layer in zip(inputs, self.weight, self.bias, strict=True)])
         return th.baddbmm(self.bias.unsqueeze(1), inputs, self.weight.transpose(1, 2))

@@ -7,7 +7,8 @@ from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.sac.policies import Actor, SACPolicy
 from torch import nn
 
-from sb3_chac.common.linear import use_fast_linear
+from sb3_chac.common.actors import use_fast_actor
+from sb3_chac.common.mlp import use_fast_mlps
 
 
 class CQLPolicy(SACPolicy):
@@ -24,12 +25,12 @@ class CQLPolicy(SACPolicy):
 
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Actor:
         actor = super().make_actor(features_extractor)
-        use_fast_linear(actor)
+        use_fast_actor(actor)
         return actor
 
     def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> ContinuousCritic:
         critic = super().make_critic(features_extractor)
-        use_fast_linear(critic)
+        use_fast_mlps(critic)
         return critic
 
 

@@ -200,6 +200,8 @@ def learn_ours(original: Callable[..., None], manager: Any, model: Any) -> None:
         manager.save_trained_model(model)  # as RL-Zoo3 does after Ctrl-C
         print(stopped, file=sys.stderr)
         sys.exit(stopped.exit_code)
+    except OSError as error:  # such as a full disk
+        raise OSError(checkpoint.farewell(str(error))) from error
 
 
 def go_on(original: Callable[..., None], manager: Any, model: Any) -> None:

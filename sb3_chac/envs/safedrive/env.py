@@ -14,24 +14,17 @@ from sb3_chac.common.checks import check_driving_action, check_integer, check_ra
 from sb3_chac.common.contract import TakeoverDisplay
 from sb3_chac.envs.display import STEPS_PER_SECOND
 from sb3_chac.envs.driving.compiled import compiled
-from sb3_chac.envs.driving.corridors import N_VIEW, ROUTE_SPACING, CorridorView, route_along
+from sb3_chac.envs.driving.corridors import N_VIEW, CorridorView
 from sb3_chac.envs.safedrive.driver import IMPERFECTIONS, ScriptedDriver
-from sb3_chac.envs.safedrive.geometry import SPACING, Pose, boxes_overlap, wrap_angle
+from sb3_chac.envs.safedrive.geometry import Pose, boxes_overlap
 from sb3_chac.envs.safedrive.lidar import Lidar
 from sb3_chac.envs.safedrive.map import BLOCKS, HALF_WIDTH, LANES, OBSTACLE_SIZES, Map
+from sb3_chac.envs.safedrive.navigation import N_EGO, N_STATE, locate, navigation, route_ahead
 from sb3_chac.envs.safedrive.traffic import CAR_LENGTH, CAR_WIDTH, Traffic
 from sb3_chac.envs.safedrive.vehicle import MAX_SPEED, Ego
 
 SUBSTEPS = 2
 ARRIVES_BEFORE_END = 5.0  # [m]
-CHECKPOINTS = np.array([8.0, 16.0, 26.0, 38.0, 50.0])  # [m] ahead on the route
-N_EGO, N_NAVIGATION = 9, 2 * len(CHECKPOINTS)
-N_STATE = N_EGO + N_NAVIGATION  # numbers before the lidar
-ROUTE = np.arange(0.0, CHECKPOINTS[-1] + ROUTE_SPACING / 2, ROUTE_SPACING)  # [m] where the route is rebuilt from them
-# Where the observation tells headings of the route (beside the ego, at the checkpoints), and [rad] what they are scaled by
-ROUTE_KNOTS = np.array([0.0, *CHECKPOINTS])  # [m]
-ROUTE_HEADINGS = np.array([2, *range(N_EGO + 1, N_STATE, 2)])
-ROUTE_HEADING_SCALES = np.array([-0.15] + [0.6] * len(CHECKPOINTS), np.float32)
 CONTACT_MEMORY = 10  # steps without contact after which touching the same object is a new collision
 PARKED_TOWED_AFTER = 50  # steps after a collision with a parked vehicle
 SCENES_KEPT = 64
@@ -232,7 +225,7 @@ class SafeDriveEnv(gym.Env, TakeoverDisplay):
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         ego = self.ego
         check_driving_action(action)
-        action = np.clip(np.asarray(action, dtype=float), -1.0, 1.0)
+        action = np.minimum(np.maximum(np.asarray(action, dtype=float), -1.0), 1.0)
         before = Pose(ego.position[0], ego.position[1], ego.heading)
         ego.control(action[0], action[1])
         for _ in range(SUBSTEPS):
@@ -260,17 +253,15 @@ class SafeDriveEnv(gym.Env, TakeoverDisplay):
 
     def _locate(self) -> None:
         """Where the ego is on the route, looked for close to where it was (the route may pass near itself)."""
-        self.s, self.lateral, self.heading_error = _locate(self.map.route, self.s, self.ego.position, self.ego.heading)
+        self.s, self.lateral, self.heading_error = locate(self.map.route, self.s, self.ego.position, self.ego.heading)
 
     def _find_boxes(self) -> None:
         """Everything that can be hit or seen: first the cars of the traffic that are there, then the obstacles."""
         traffic, scene = self.traffic, self.scene
-        there = np.flatnonzero(traffic.obstacle_there)
-        n_cars = len(traffic.visible)
-        self.box_positions = np.concatenate([traffic.positions, scene.obstacle_positions[there]])
-        self.box_headings = np.concatenate([traffic.headings, scene.obstacle_headings[there]])
-        self.box_lengths = np.concatenate([np.full(n_cars, CAR_LENGTH), scene.obstacle_sizes[there, 0]])
-        self.box_widths = np.concatenate([np.full(n_cars, CAR_WIDTH), scene.obstacle_sizes[there, 1]])
+        obstacles = scene.obstacle_positions, scene.obstacle_headings, scene.obstacle_sizes, traffic.obstacle_there
+        self.box_positions, self.box_headings, self.box_lengths, self.box_widths = _boxes(
+            traffic.positions, traffic.headings, *obstacles
+        )
 
     @property
     def box_ids(self) -> list[tuple[str, int]]:
@@ -293,7 +284,7 @@ class SafeDriveEnv(gym.Env, TakeoverDisplay):
         size = ego.LENGTH, ego.WIDTH
         boxes = self.box_positions[near], self.box_headings[near], self.box_lengths[near], self.box_widths[near]
         hits = near[boxes_overlap(ego.position, ego.heading, *size, *boxes)]
-        box_ids = self.box_ids
+        box_ids = self.box_ids if len(hits) else []
         for i in hits:
             kind, index = box_ids[i]
             if self.steps - self._touched.get((kind, index), -CONTACT_MEMORY) >= CONTACT_MEMORY:
@@ -317,23 +308,19 @@ class SafeDriveEnv(gym.Env, TakeoverDisplay):
     # What the agent is told
 
     def _observe(self) -> np.ndarray:
-        ego, route = self.ego, self.map.route
+        ego = self.ego
         distances, self.seen = self.scan()
         observation = np.empty(self._n_observation, np.float32)
         off_lane = self.lateral - LANES[int(self.lateral > 0)]
+        to_edge = min(max(self.lateral / HALF_WIDTH, -1.0), 1.0)
         observation[:N_EGO] = (
-            self.lateral / HALF_WIDTH, -self.lateral / HALF_WIDTH, math.tanh(self.heading_error / 0.15),
+            to_edge, -to_edge, math.tanh(self.heading_error / 0.15),
             2 * ego.speed / MAX_SPEED - 1, math.tanh(ego.steering / 0.15), *self.last_action,
             math.tanh(ego.yaw_rate / 0.3), math.tanh(off_lane / 0.5),
         )  # fmt: skip
-        points = route[np.minimum(((self.s + CHECKPOINTS) / SPACING).astype(int), len(route) - 1)]
-        d = points[:, :2] - ego.position
-        bearing = wrap_angle(np.arctan2(d[:, 1], d[:, 0]) - ego.heading)
-        observation[N_EGO:N_STATE:2] = np.tanh(bearing / 0.4)
-        observation[N_EGO + 1 : N_STATE : 2] = np.tanh(wrap_angle(points[:, 2] - ego.heading) / 0.6)
+        observation[N_EGO:N_STATE] = navigation(self.map.route, self.s, ego.position, ego.heading)
         lidar = observation[N_STATE : N_STATE + self.lidar.rays]
         lidar[:] = 1 - distances / self.lidar.reach
-        observation[:2] = np.clip(observation[:2], -1.0, 1.0)  # beside the road
         if self._corridors is not None:
             observation[N_STATE + self.lidar.rays :] = self._corridors(lidar, *route_ahead(observation))
         return observation
@@ -422,33 +409,15 @@ class SafeDriveEnv(gym.Env, TakeoverDisplay):
     _road: tuple[Map, Road] | None = None
 
 
-def route_ahead(observation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """
-    Rebuild the middle of the route from an observation: its direction at the ego and at the checkpoints, integrated.
-
-    :param observation: shape (259,) or longer
-    :return: [m] points every metre from beside the ego to 50 m ahead, in the ego's frame, shape (51, 2), and [rad] the
-        route's headings there, shape (51,)
-    """
-    tanhs = np.minimum(np.maximum(observation[ROUTE_HEADINGS], -0.999999), 0.999999)
-    headings = np.interp(ROUTE, ROUTE_KNOTS, np.arctanh(tanhs) * ROUTE_HEADING_SCALES)
-    lateral = float(observation[0] * HALF_WIDTH)
-    return route_along(np.sin(headings[0]) * lateral, -np.cos(headings[0]) * lateral, headings), headings
-
-
 @compiled
-def _locate(route: np.ndarray, s: float, position: np.ndarray, heading: float) -> tuple[float, float, float]:
+def _boxes(car_positions, car_headings, positions, headings, sizes, there):
     """
-    Find where a vehicle is on the route, close to where it was (the route may pass near itself).
-
-    :param s: [m] along the route, where it was
-    :return: s [m], lateral [m] and the heading against that of the route [rad]
+    :param positions: of the obstacles, shape (n, 2), with their headings, sizes (length, width) and whether they are there
+    :return: positions, headings, lengths and widths of the cars, then of the obstacles that are there
     """
-    first = max(0, int(s / SPACING) - 16)
-    dx, dy = position[0] - route[first : first + 40, 0], position[1] - route[first : first + 40, 1]
-    nearest = np.argmin(dx**2 + dy**2)
-    x, y, there, curvature = dx[nearest], dy[nearest], route[first + nearest, 2], route[first + nearest, 3]
-    along = x * np.cos(there) + y * np.sin(there)
-    lateral = y * np.cos(there) - x * np.sin(there)
-    error = heading - there - curvature * along
-    return (first + nearest) * SPACING + along, lateral, (error + np.pi) % (2 * np.pi) - np.pi
+    n_cars, obstacles = len(car_headings), np.flatnonzero(there)
+    boxes = np.empty((n_cars + len(obstacles), 2))
+    boxes[:n_cars], boxes[n_cars:] = car_positions, positions[obstacles]
+    lengths, widths = np.full(len(boxes), CAR_LENGTH), np.full(len(boxes), CAR_WIDTH)
+    lengths[n_cars:], widths[n_cars:] = sizes[obstacles, 0], sizes[obstacles, 1]
+    return boxes, np.concatenate((car_headings, headings[obstacles])), lengths, widths

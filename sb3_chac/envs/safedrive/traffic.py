@@ -105,9 +105,7 @@ class Traffic:
 
     def update_visible(self) -> None:
         """Where the cars are that one can see: ``visible`` (indices), ``positions`` and ``headings``."""
-        self.visible = np.flatnonzero((self.state == DRIVING) | (self.state == CRASHED))
-        path, s, lateral = self.path[self.visible], self.s[self.visible], self.lateral[self.visible]
-        self.positions, self.headings = _poses(*self._tables, path, s, lateral)
+        self.visible, self.positions, self.headings = _visible(*self._tables, self.path, self.s, self.lateral, self.state)
 
     def crash(self, car: int) -> None:
         """The car stands where it is, and is towed away after some seconds."""
@@ -219,6 +217,16 @@ def _poses(points, first, last, path, s, lateral):
     for i in range(len(s)):
         positions[i, 0], positions[i, 1], headings[i] = _pose(points, first, last, path[i], s[i], lateral[i])
     return positions, headings
+
+
+@compiled
+def _visible(points, first, last, path, s, lateral, state):
+    """
+    :return: indices, positions and headings of the cars of the map that are there
+    """
+    cars = np.flatnonzero((state == DRIVING) | (state == CRASHED))
+    positions, headings = _poses(points, first, last, path[cars], s[cars], lateral[cars])
+    return cars, positions, headings
 
 
 @compiled
