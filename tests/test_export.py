@@ -84,7 +84,9 @@ def test_torchscript(name, kwargs, n_example):
 
 @each_case
 @pytest.mark.parametrize("dynamo", [False, True], ids=["script", "dynamo"])
-def test_onnx(name, kwargs, dynamo, tmp_path):
+def test_onnx(name, kwargs, dynamo, tmp_path, monkeypatch):
+    # SB3's distributions check their parameters, a branch on data that torch.export refuses (of SB3's SAC and PPO, too)
+    monkeypatch.setattr(th.distributions.Distribution, "_validate_args", not dynamo)
     model, expected = trained(name, kwargs)
     file = str(tmp_path / "policy.onnx")
     batch = {"dynamic_shapes": ({0: th.export.Dim("batch")},)} if dynamo else {"dynamic_axes": {"observation": {0: "batch"}}}
