@@ -3,6 +3,8 @@
 They make the stock ``rl_zoo3`` command know our algorithms, see ``sb3_chac/_startup.py``.
 """
 
+import json
+import os
 from pathlib import Path
 
 from setuptools.command.build_py import build_py
@@ -40,7 +42,8 @@ class EditableWheel(editable_wheel):
 
             def __call__(self, wheel, files, mapping):
                 strategy(wheel, files, mapping)
+                here = json.dumps(repr(os.getcwd()))[1:-1]  # a literal inside a literal
                 for name in STARTUP_FILES:
-                    wheel.writestr(name, Path(name).read_bytes())
+                    wheel.writestr(name, Path(name).read_text().replace("sitedir", here))  # where the package is
 
         return WithStartupFiles()

@@ -1,9 +1,11 @@
 """
-Can SafeDrive be driven from what the agent observes? Imitate the scripted driver with DAgger (Ross et al. 2011) and see
+Can a simulator be driven from what the agent observes? Imitate the scripted driver with DAgger (Ross et al. 2011) and see
 how far a plain MLP gets.
 
     python benchmarks/dagger.py                 # results/safedrive/dagger.csv
+    python benchmarks/dagger.py --no-corridors  # from the observation without its corridors
     python benchmarks/dagger.py --first 100 --maps 20 --labels 50000   # how far 20 maps carry
+    SB3_CHAC_METADRIVE_HEADLESS=1 python benchmarks/dagger.py --env MetaDriveSafety-v0   # results/metadrive/dagger.csv
 
 The labels are the ideal driver's actions in the states that the imitation visits; a share of the episodes, which falls
 from 1 to 0, is driven by the driver.
@@ -21,7 +23,8 @@ from torch import nn
 
 import sb3_chac.envs  # noqa: F401
 
-RESULTS = Path(__file__).parent / "results" / "safedrive"
+RESULTS = Path(__file__).parent / "results"
+FOLDERS = {"SafeDrive-v0": "safedrive", "MetaDriveSafety-v0": "metadrive"}
 
 
 def drive(env, policy, expert, scenarios, rng, expert_share=0.0, steps=None):
@@ -45,6 +48,8 @@ def drive(env, policy, expert, scenarios, rng, expert_share=0.0, steps=None):
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--env", choices=FOLDERS, default="SafeDrive-v0")
+    parser.add_argument("--corridors", action=argparse.BooleanOptionalAction, default=True, help="observe the corridors")
     parser.add_argument("--labels", type=int, default=200_000)
     parser.add_argument("--round", type=int, default=10_000, help="labels between two fits")
     parser.add_argument("--first", type=int, default=20_000, help="first map to learn on")
@@ -55,12 +60,13 @@ def main() -> None:
     parser.add_argument("--epochs", type=int, default=4)
     parser.add_argument("--hidden", type=int, default=256, help="width of both hidden layers")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--out", type=Path, default=RESULTS / "dagger.csv")
+    parser.add_argument("--out", type=Path, help="default: dagger.csv in the simulator's folder of benchmarks/results")
     args = parser.parse_args()
+    out = args.out or RESULTS / FOLDERS[args.env] / "dagger.csv"
     th.manual_seed(args.seed)
     th.set_num_threads(1)
     rng = np.random.default_rng(args.seed)
-    env = gym.make("SafeDrive-v0").unwrapped
+    env = gym.make(args.env, corridors=args.corridors).unwrapped
     expert = env.scripted_driver("scripted-ideal")
     n_inputs, n = env.observation_space.shape[0], args.hidden
     net = nn.Sequential(nn.Linear(n_inputs, n), nn.ReLU(), nn.Linear(n, n), nn.ReLU(), nn.Linear(n, 2), nn.Tanh())
@@ -89,34 +95,33 @@ def main() -> None:
                 optimizer.zero_grad()
                 loss.backward()
                 optimizer.step()
-        success, cost, total, completion = episodes.mean(axis=0)
+        success, cost, total, completion = episodes.mean(axis=0).tolist()
         print(
             f"{len(data_x)} labels, loss {loss.item():.4f}, while learning: success {success:.2f} cost {cost:.2f}", flush=True
         )
         if last or len(data_x) // args.every > (len(data_x) - len(x)) // args.every:
             tests = range(args.test, args.test + args.episodes)
             _, _, episodes = drive(env, policy, expert, tests, rng)
-            success, cost, total, completion = episodes.mean(axis=0)
-            row = [
-                args.hidden,
-                args.seed,
-                args.maps,
-                len(data_x),
-                round(loss.item(), 5),
-                round(success, 3),
-                round(cost, 3),
-                round(total, 1),
-                round(completion, 3),
-            ]
+            success, cost, total, completion = episodes.mean(axis=0).tolist()
+            row = {
+                "env": args.env,
+                "corridors": args.corridors,
+                "hidden": args.hidden,
+                "seed": args.seed,
+                "maps": args.maps,
+                "labels": len(data_x),
+                "loss": round(loss.item(), 5),
+                "success": round(success, 3),
+                "cost": round(cost, 3),
+                "return": round(total, 1),
+                "route_completion": round(completion, 3),
+            }
             print("test:", row, f"{time.process_time() - start:.0f} s", flush=True)
-            args.out.parent.mkdir(parents=True, exist_ok=True)
-            new = not args.out.exists()
-            with args.out.open("a", newline="") as file:
-                writer = csv.writer(file)
-                if new:
-                    writer.writerow(
-                        ["hidden", "seed", "maps", "labels", "loss", "success", "cost", "return", "route_completion"]
-                    )
+            out.parent.mkdir(parents=True, exist_ok=True)
+            with out.open("a", newline="") as file:
+                writer = csv.DictWriter(file, list(row))
+                if file.tell() == 0:
+                    writer.writeheader()
                 writer.writerow(row)
 
 

@@ -6,8 +6,8 @@
     python benchmarks/guidance.py agents           # copies one trained agent per method to benchmarks/agents/
 
 Hyperparameters are those of ``hyperparams/<algo>.yml``. Training maps 100-119; every evaluation is one deterministic episode
-on each of the maps 1000-1049, without the human. Seeds 0-2 are the reported ones; tuning is done on seeds from 100 and maps
-2000-2049. C-HAC and its ablations share their stage 1. With ``--env MetaDriveSafety-v0``, the same there.
+on each of the maps 1000-1199, without the human. Seeds 0-2 are the reported ones; tuning is done on seeds from 100 and maps
+2000-2199. C-HAC and its ablations share their stage 1. With ``--env MetaDriveSafety-v0``, the same there.
 One CSV per run is written to benchmarks/results/guidance/ (guidance-metadrive/), a row per evaluation as it comes; a run that
 was cut off starts anew. Models go to --models.
 """
@@ -56,6 +56,7 @@ class Method(NamedTuple):
     title: str
     overrides: dict[str, Any] = {}  # noqa: RUF012
     goes_on_from: str | None = None  # the method whose last state it starts with
+    budget: int | None = None  # steps of the human, if not that of the yaml
 
 
 METHODS = {
@@ -63,6 +64,8 @@ METHODS = {
     "dsac": Method("dsac", 200_000, "DSAC"),
     "pvp": Method("pvp", SWITCH, "PVP"),
     "dpvp": Method("dpvp", SWITCH, "D-PVP"),
+    "dpvp-1k": Method("dpvp", SWITCH, "D-PVP, 1K human steps", budget=1000),
+    "dpvp-2k": Method("dpvp", SWITCH, "D-PVP, 2K human steps", budget=2000),
     "chac-stage-1": Method("chac", SWITCH, "C-HAC, end of stage 1"),
     "chac": Method("chac", 200_000, "C-HAC", {}, "chac-stage-1"),
     "chac-no-share": Method("chac", 100_000, "C-HAC, No Share", {"shared_control": False}, "chac-stage-1"),
@@ -84,10 +87,13 @@ def versions(env_id: str) -> str:
     return " ".join(f"{name}={importlib.metadata.version(name)}" for name in names)
 
 
-def make_model(algo: str, seed: int, env_id: str, **overrides: Any) -> BaseAlgorithm:
-    """As ``rl_zoo3 train --algo <algo> --env <env_id>`` makes it."""
+def make_model(algo: str, seed: int, env_id: str, budget: int | None = None, **overrides: Any) -> BaseAlgorithm:
+    """As ``rl_zoo3 train --algo <algo> --env <env_id>`` makes it, with another budget of the human if there is one."""
     params = yaml.safe_load(hyperparams_file(algo).read_text())[env_id]
     del params["n_timesteps"]
+    if budget is not None:
+        (wrapper_kwargs,) = params["env_wrapper"][0].values()
+        wrapper_kwargs["budget"] = budget
     wrapper = get_wrapper_class(params)
     params.pop("env_wrapper", None)
     policy_kwargs = eval(params.get("policy_kwargs", "dict()"), {"dict": dict, "th": th})
@@ -134,7 +140,7 @@ def run(
     path.unlink(missing_ok=True)
     for folder in (results, models):
         folder.mkdir(parents=True, exist_ok=True)
-    model = make_model(method.algo, seed, env_id)
+    model = make_model(method.algo, seed, env_id, method.budget)
     training_cost = 0.0
     if method.goes_on_from is not None:
         start = models / f"{method.goes_on_from}-{seed}.zip"

@@ -17,6 +17,7 @@ import signal
 import sys
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from pathlib import Path
+from types import FrameType
 
 import suite_job
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -178,6 +179,25 @@ class OnRay:
         self.ray.shutdown()
 
 
+class Stopped(BaseException):
+    """
+    Raised in the main thread.
+
+    :param number: of the signal
+    """
+
+    def __init__(self, number: int) -> None:
+        super().__init__(signal.Signals(number).name)
+        self.number = number
+
+
+def stop(number: int, frame: FrameType | None) -> None:
+    """The second signal does what it does elsewhere."""
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    raise Stopped(number)
+
+
 def run(args: argparse.Namespace) -> None:
     """Does what is not done yet; a job that fails does not stop the others."""
     results = Results(args.results)
@@ -189,7 +209,8 @@ def run(args: argparse.Namespace) -> None:
     print(f"{len(states)} jobs: {len(states) - len(todo) - len(left_alone)} done, {len(todo)} to do", flush=True)
     if not todo:
         return
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, stop)
     runner = OnRay(args.ray) if args.ray else Here(args.jobs)
     failures = []
     columns = [TextColumn("{task.description}"), BarColumn(), TaskProgressColumn()]
@@ -211,6 +232,10 @@ def run(args: argparse.Namespace) -> None:
                         progress.print(f"{job.name} failed: {error}", markup=False)
                 share = sum(cost(job) * runner.share_done(job, args.work) for job in futures.values())
                 progress.update(bar, completed=done + share, description=f"{len(todo) - len(futures)} of {len(todo)} jobs")
+    except Stopped as stopped:
+        runner.close()
+        print(f"Stopped by {stopped}; the same command goes on from the checkpoints.", file=sys.stderr)
+        sys.exit(128 + stopped.number)
     finally:
         runner.close()
     if failures:

@@ -4,6 +4,7 @@ Everything that a job needs is in ``Job``, and all that it leaves is in ``Outcom
 that has sb3_chac. It can be stopped at any time; run again in the same ``work`` folder, it goes on from its newest checkpoint.
 """
 
+import contextlib
 import csv
 import ctypes
 import fcntl
@@ -24,7 +25,7 @@ import numpy as np
 import yaml
 
 import sb3_chac
-from sb3_chac.common.checkpoints import FOLDER, newest_checkpoint
+from sb3_chac.common.checkpoints import FOLDER, newest_checkpoint, sound_checkpoint
 from sb3_chac.human.demonstrations import load_demonstrations
 from sb3_chac.plot import join
 from sb3_chac.resume import steps
@@ -197,7 +198,7 @@ def train(job: Job, folder: Path) -> Path:
     done = folder / "trained"  # holds the path of the model
     if not done.exists():
         runs = run_folders(job, folder)
-        while runs and newest_checkpoint(runs[-1] / FOLDER) is None:  # killed before it had one
+        while runs and sound_checkpoint(runs[-1] / FOLDER)[0] is None:  # killed before it had one, or damaged
             shutil.rmtree(runs.pop())
         if runs:
             call(folder, "resume", runs[-1])
@@ -236,6 +237,8 @@ def call(folder: Path, *arguments: Any) -> None:
     :param folder: of the job, gets what the command prints
     :raises JobFailed: unless it ends well
     """
+    if stopping:
+        raise JobFailed("stopped.")
     log = folder / "log.txt"
     environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONWARNINGS": "ignore"}
     command = [sys.executable, "-m", "sb3_chac", *map(str, arguments)]
@@ -251,6 +254,8 @@ def call(folder: Path, *arguments: Any) -> None:
             preexec_fn=end_with_parent,
         )
         running.append(process)
+        if stopping:  # it was begun while all were stopped
+            process.terminate()
         try:
             code = process.wait()
         finally:
@@ -262,6 +267,7 @@ def call(folder: Path, *arguments: Any) -> None:
 
 
 running: list[subprocess.Popen[bytes]] = []
+stopping = False  # no job begins anything new
 PR_SET_PDEATHSIG = 1
 
 
@@ -272,8 +278,16 @@ def end_with_parent() -> None:
 
 
 def stop_all() -> None:
+    """
+    Ends what runs in good order: a training writes a checkpoint first. Returns when nothing runs any more.
+    """
+    global stopping
+    stopping = True
     for process in list(running):
-        stop(process)
+        with contextlib.suppress(ProcessLookupError):
+            process.terminate()
+    for process in list(running):
+        process.wait()
 
 
 def stop(process: subprocess.Popen[bytes]) -> None:

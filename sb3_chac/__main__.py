@@ -17,7 +17,8 @@ RL-Zoo3's commands with the algorithms of sb3_chac, and
   resume RUN_FOLDER     go on with a training that was interrupted or killed, from its newest checkpoint
   plot RUN_FOLDER       its curves: return, success rate, safety cost, what the human drove
   demos COMMAND         demonstrations: record them, look at them, drive them again
-'sb3-chac train --help' lists the arguments, so does --help of the others."""
+'sb3-chac train --help' lists the arguments, so does --help of the others.
+Models, replay buffers, run folders and hyperparameters files are code (docs/loading.md): open those that you trust only."""
 
 
 def main() -> None:
@@ -31,11 +32,11 @@ def main() -> None:
         import_module(f"sb3_chac.{command}").main(sys.argv[2:])
         return
 
-    from rl_zoo3.cli import main as zoo_main
-
     from sb3_chac.zoo import register
 
     register()
+    from rl_zoo3.cli import main as zoo_main  # takes the commands as they are now
+
     zoo_main()
 
 

@@ -17,7 +17,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_chac.common import pictures
-from sb3_chac.common.episodes import NotEvaluable, Runner, Task, make_env
+from sb3_chac.common.episodes import NotEvaluable, Runner, Task, make_env, registered_spec
 from sb3_chac.common.evaluation import saved_model
 from sb3_chac.evaluate import DEFAULT_ENV, check_output, find_algorithm, find_normalization, load_model, parse_env_kwargs
 from sb3_chac.human.dataset_writer import SETTINGS
@@ -37,10 +37,10 @@ DESCRIPTION = """Demonstrations are datasets in Minari's format, see 'minari lis
 
 RECORD = """Record whole episodes until there are at least --steps steps. With --novice, that model drives and the expert
 watches it, takes over by --rule and hands back. The dataset does not depend on --jobs; nothing is left of one that is
-interrupted."""
+interrupted. Models are code (docs/loading.md): open those that you trust only."""
 
 REPLAY = """Make the environment again, reset it with the recorded seed and scenario, and repeat the actions of one episode. It
-tells how far that led elsewhere than when it was recorded."""
+tells how far that led elsewhere than when it was recorded. The environment must be registered: a dataset runs no code."""
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -153,8 +153,9 @@ def find_model(path: Path, env_id: str, env_kwargs: dict[str, Any]) -> tuple[Bas
     path, algo, algorithm = find_algorithm(path, None)
     env = make_env(env_id, env_kwargs)
     model = load_model(path, algo, algorithm, env)
+    normalize = find_normalization(path, env_id, env)[1]
     env.close()
-    return model, find_normalization(path, env_id)[1]
+    return model, normalize
 
 
 def run_info(args: argparse.Namespace) -> None:
@@ -250,7 +251,7 @@ class Replay(Runner):
     :param number: of the episode
     :param render_mode: of the environment
     :raises DatasetError: if there is no such episode, or neither its environment nor its seed is known
-    :raises NotEvaluable: if the environment cannot be made
+    :raises NotEvaluable: if the environment cannot be made, see ``registered_spec``
     """
 
     def __init__(self, dataset: "MinariDataset", number: int, render_mode: str | None = None) -> None:
@@ -265,6 +266,7 @@ class Replay(Runner):
         self.recorded = dataset[number]
         self.observations: list[np.ndarray] = []
         self.rewards: list[float] = []
+        spec = registered_spec(spec, f"dataset {dataset.id}")
         super().__init__(Task(lambda observation: None, spec, {}), render_mode)
 
     def __enter__(self) -> "Replay":

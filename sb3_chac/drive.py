@@ -37,7 +37,9 @@ DESCRIPTION = """Train with yourself as the human: watch the novice drive, take 
   sb3-chac drive --resume logs/chac/SafeDrive-v0_1                    go on, with all that was learned and driven
 
 Hyperparameters, run folders and files are those of 'rl_zoo3 train'. The drive is recorded as a dataset, see
-'sb3-chac demos'. The operator's guide is sb3_chac/cockpit/README.md."""
+'sb3-chac demos'. The operator's guide is sb3_chac/cockpit/README.md.
+
+Models, run folders and hyperparameters files are code (docs/loading.md): open those that you trust only."""
 
 SAVE_FREQ = 600  # steps: a minute
 
@@ -62,6 +64,8 @@ def make_parser() -> argparse.ArgumentParser:
         "--device", default="auto", choices=("auto", "keyboard", "gamepad", "wheel"), help="(default: %(default)s)"
     )
     how.add_argument("--serve", metavar="[HOST:]PORT", help="no window, but a page to drive in (default host: 127.0.0.1)")
+    how.add_argument("--tls-cert", type=Path, metavar="FILE", help="with --serve: encrypt with this certificate (PEM)")
+    how.add_argument("--tls-key", type=Path, metavar="FILE", help="its key (PEM), if that is in another file")
     how.add_argument("--config", type=Path, metavar="FILE", help="axes and buttons of gamepad or wheel, see --calibrate")
     how.add_argument("--rate", type=float, metavar="HZ", help="steps per second (default: the environment's own real time)")
     how.add_argument(
@@ -190,6 +194,8 @@ def check_arguments(args: argparse.Namespace) -> None:
         raise NotDrivable(f"--rate must be from 0.5 to 100 steps per second, got {args.rate:g}.")
     if args.serve and (args.device != "auto" or args.config):
         raise NotDrivable("--serve is driven with the browser's devices: leave out --device and --config.")
+    if (args.tls_cert or args.tls_key) and not (args.serve and args.tls_cert):
+        raise NotDrivable("--tls-cert and --tls-key: both are for --serve, and a key needs its certificate.")
     if args.serve:
         args.serve = parse_address(args.serve)
     if args.device == "keyboard" and args.config:
@@ -247,11 +253,12 @@ def in_browser(args: argparse.Namespace) -> Any:
     """
     from sb3_chac.cockpit.browser import Browser
     from sb3_chac.cockpit.run import DriveRun
-    from sb3_chac.cockpit.server import serve
+    from sb3_chac.cockpit.server import serve, tls_context
 
+    tls = tls_context(args.tls_cert, args.tls_key) if args.tls_cert else None
     device = Browser()
     drive_run = DriveRun(args, device)
-    asyncio.run(serve(drive_run.drive, device, args.serve, lambda: begin(drive_run), lambda: drive_run.is_over))
+    asyncio.run(serve(drive_run.drive, device, args.serve, lambda: begin(drive_run), lambda: drive_run.is_over, tls))
     drive_run.thread.join()
     return drive_run
 

@@ -6,7 +6,6 @@ import csv
 import inspect
 import json
 import os
-import pickle
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,7 @@ from huggingface_sb3 import EnvironmentName
 from rl_zoo3 import utils
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.save_util import load_from_zip_file
-from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_chac.chac import CHAC
 from sb3_chac.chac.policies import CONTROLS
@@ -39,7 +38,9 @@ and steps, as mean ± standard deviation over the episodes. The results do not d
 
 If <folder of the model>/<env>/vecnormalize.pkl exists, where RL-Zoo3 leaves it, observations are normalized with it.
 Cost, success and route completion are only reported if the environment's info has 'cost', 'is_success' and
-'route_completion' in every episode; the JSON file leaves out what is not there. Load models that you trust only."""
+'route_completion' in every episode; the JSON file leaves out what is not there.
+
+A model and its vecnormalize.pkl are code (docs/loading.md): load those that you trust only."""
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -101,7 +102,7 @@ def main(arguments: list[str]) -> None:
     th.set_num_threads(1)
     try:
         run(args)
-    except (NotEvaluable, FileNotFoundError) as error:
+    except (NotEvaluable, OSError) as error:  # such as a full disk
         parser.exit(2, f"{parser.prog}: error: {error}\n")
 
 
@@ -133,8 +134,8 @@ def run(args: argparse.Namespace) -> None:
         env = make_env(args.env, env_kwargs)
         policy = load_model(path, algo, algorithm, env, args.policy)
         others |= {name: load_model(path, algo, algorithm, env, name) for name in args.beside if name in CONTROLS}
+        statistics, normalize = find_normalization(path, args.env, env)
         env.close()
-        statistics, normalize = find_normalization(path, args.env)
         print(f"{path}: {algorithm.__name__}" + (f", observations normalized with {statistics}" if normalize else ""))
         who = {"model": str(path), "algo": algo}
 
@@ -358,17 +359,16 @@ def remedy_for(path: Path, env: gym.Env) -> str:
     return remedy and f".{remedy}"
 
 
-def find_normalization(model: Path, env: str) -> tuple[Path, VecNormalize | None]:
+def find_normalization(model: Path, env_id: str, env: gym.Env) -> tuple[Path, VecNormalize | None]:
     """
+    :param env: that the model fits
     :return: where RL-Zoo3 leaves the statistics of a model's observations, and the VecNormalize there, None if there is none
     :raises NotEvaluable: if the file cannot be read
     """
-
-    path = model.parent / EnvironmentName(env) / "vecnormalize.pkl"
+    path = model.parent / EnvironmentName(env_id) / "vecnormalize.pkl"
     if not path.is_file():
         return path, None
     try:
-        with path.open("rb") as file:
-            return path, pickle.load(file)
+        return path, VecNormalize.load(str(path), DummyVecEnv([lambda: env]))
     except Exception as error:  # pickle raises nearly anything
         raise NotEvaluable(f"{path} cannot be read: {error}") from error

@@ -74,7 +74,11 @@ def main(arguments: list[str]) -> None:
         parser.exit(2, f"{parser.prog}: error: {error}\n")
     figure = draw(curves)
     figure.suptitle(", ".join(map(str, args.run_folders)), fontsize="medium")
-    figure.savefig(out, dpi=150)
+    try:
+        figure.savefig(out, dpi=150)
+    except OSError as error:  # such as a full disk
+        out.unlink(missing_ok=True)
+        parser.exit(2, f"{parser.prog}: error: --out {out}: cannot be written ({error.strerror or error}).\n")
     print(f"Saved {out}")
 
 

@@ -8,7 +8,7 @@ import zipfile
 from importlib import import_module
 from pathlib import Path
 
-from sb3_chac.common.checkpoints import FOLDER, newest_checkpoint
+from sb3_chac.common.checkpoints import FOLDER, checkpoints, sound_checkpoint
 from sb3_chac.zoo import register
 
 DESCRIPTION = """Go on with a training that was interrupted or killed (kill -9, a power cut), from its newest checkpoint.
@@ -18,10 +18,12 @@ DESCRIPTION = """Go on with a training that was interrupted or killed (kill -9, 
 Run it in the folder where the training was started: its command line is repeated, for the steps that remain. Model,
 optimizers, replay buffer, stage, counts and the human's budget are those of the checkpoint; the seeds are others, so that no
 episode is seen twice. What was done after the checkpoint is lost. Episodes, evaluations and checkpoints go into a run folder
-of its own (_2 after _1), which can be resumed in turn.
+of its own (_2 after _1), which can be resumed in turn. If the newest checkpoint is damaged, the one before it is used.
 
 'rl_zoo3 train' with an algorithm of sb3_chac writes a checkpoint every --save-freq steps (10000 if it is not given, none with
---save-freq 0) and at the end, and keeps the newest in <run folder>/checkpoints. Resume run folders that you trust only."""
+--save-freq 0), at the end, and when it is stopped by SIGTERM or Ctrl-C, and keeps the newest two in <run folder>/checkpoints.
+
+A run folder is code: models, replay buffers and command lines in it can run anything. Resume those that you trust only."""
 
 
 class NotResumable(ValueError):
@@ -75,12 +77,17 @@ def find_training(run_folder: Path) -> tuple[list[str], Path]:
         command = [str(argument) for argument in json.loads(files[0].read_text())]
     except (OSError, ValueError, TypeError) as error:
         raise NotResumable(f"{files[0]} cannot be read: {error}") from error
-    checkpoint = newest_checkpoint(run_folder / FOLDER)
+    checkpoint, problems = sound_checkpoint(run_folder / FOLDER)
     if checkpoint is None:
+        none = f"no checkpoint that is sound: {' '.join(problems)}" if problems else "no checkpoint yet."
+        again = f"sb3-chac {shlex.join(command)}" if command[:1] == ["drive"] else f"rl_zoo3 train {shlex.join(command)}"
         raise NotResumable(
-            f"{run_folder} holds no checkpoint yet. If it was itself resumed, resume the run before it; else start anew with\n"
-            f"  rl_zoo3 train {shlex.join(command)}"
+            f"{run_folder} holds {none} If it was itself resumed, resume the run before it; else start anew with\n  {again}"
         )
+    if problems:
+        newest = checkpoints(run_folder / FOLDER)[0]
+        lost = int(newest.name) - int(checkpoint.name)
+        print(f"{' '.join(problems)} Going on from {checkpoint} instead, which costs {lost} steps.", file=sys.stderr)
     parser = argparse.ArgumentParser(add_help=False)
     parser.add_argument("-f", "--log-folder", default="logs")
     log_folder = Path(parser.parse_known_args(command)[0].log_folder)

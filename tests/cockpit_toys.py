@@ -1,7 +1,5 @@
 """A drive without a window: a car that is a point, and what stands around it."""
 
-import time
-
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
@@ -49,10 +47,3 @@ def cockpit(tmp_path, device, car=None, rate=1000.0):
     env = Cockpit(watched, drive, Recorder(tmp_path, car, str(tmp_path / "drive-v0"), "test", 0.1))
     drive.go_on()
     return env, drive, car
-
-
-def wait_until(condition, seconds=10.0):
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "it did not happen"
-        time.sleep(0.002)

@@ -129,4 +129,5 @@ def make_batch(observations, actions, takeovers, **columns):
         as_column.get("novice_actions", actions),
         th.as_tensor(takeovers, dtype=th.float32).reshape(n_rows, 1),
         as_column.get("takeover_starts", zeros),
+        as_column.get("costs", zeros),
     )

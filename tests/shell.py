@@ -2,7 +2,22 @@
 
 import os
 import subprocess
+import time
+from collections.abc import Callable
 from pathlib import Path
+
+FOREVER = 1800.0  # [s] no verdict on how fast the machine is: only against hanging for ever
+
+
+def wait_until(condition: Callable[[], object], pause: float = 0.002) -> None:
+    """
+    :param condition: returns when it holds
+    :param pause: [s] between two looks
+    """
+    end = time.monotonic() + FOREVER
+    while not condition():
+        assert time.monotonic() < end, "it did not happen"
+        time.sleep(pause)
 
 
 def clean_environment() -> dict[str, str]:
@@ -24,7 +39,7 @@ def run(*command: str | Path, cwd: Path, env: dict[str, str] | None = None, fail
         env={**clean_environment(), **(env or {})},
         capture_output=True,
         text=True,
-        timeout=900,
+        timeout=FOREVER,
     )
     output = completed.stdout + completed.stderr
     assert (completed.returncode != 0) == fails, output

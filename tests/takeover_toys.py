@@ -6,6 +6,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
+from sb3_chac.common.contract import TakeoverDisplay
 from sb3_chac.human import InterventionWrapper, TakeoverRule
 
 NOVICE = np.array([0.5, 0.0], np.float32)
@@ -65,7 +66,7 @@ class PredictingDriver(NoisyDriver):
         return 0.5 if action[0] > 0 else math.inf
 
 
-class DrivenIntegrator(Integrator):
+class DrivenIntegrator(Integrator, TakeoverDisplay):
     """Has scripted drivers, as SafeDrive has, and a display."""
 
     hud = None

@@ -163,3 +163,12 @@ def test_nan_in_a_dict_observation_names_the_key_and_the_environment():
     model = DSAC("MultiInputPolicy", env, policy_kwargs=small(), buffer_size=50)
     with pytest.raises(ValueError, match=r"observation 'speed' of environment 1 is NaN or infinite at step 6"):
         model.learn(20)
+
+
+@pytest.mark.parametrize("action", [[np.nan, 0], [0, np.inf], [0], [0, 0, 0], "left", None])
+def test_actions_that_are_none_do_not_move_the_car(action):
+    env = gym.make("SafeDrive-v0", horizon=5).unwrapped
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match=r"^action must be two finite numbers.*got.*did not make a step"):
+        env.step(action)
+    assert env.steps == 0

@@ -2,6 +2,7 @@
 
 import ast
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
@@ -404,7 +405,8 @@ def test_the_executed_action_is_stored(shared_control, sign, who):
 )
 def test_z_c_bootstraps_on(stage, bootstrap, shared_control, expected):
     alpha = 0.05
-    model = make_chac(bootstrap=bootstrap, shared_control=shared_control, ent_coef=alpha, delta=0.0, gamma=0.5).learn(30)
+    kwargs = dict(bootstrap=bootstrap, shared_control=shared_control, ent_coef=alpha, delta=0.0, gamma=0.5)
+    model = make_chac(normalize_rewards=False, cost_coef=3.0, **kwargs).learn(30)
     if stage == 2:
         model.policy.start_stage_2()
         for actor in (model.self_actor, model.self_actor_target):
@@ -417,6 +419,7 @@ def test_z_c_bootstraps_on(stage, bootstrap, shared_control, expected):
         next_observations=rng.normal(size=(6, 2)),
         rewards=rng.normal(size=6),
         dones=[0, 0, 0, 1, 0, 0],
+        costs=[0, 1, 0, 0, 2, 0],
     )
     seen = {}
     model._critic_losses = lambda critic, batch, targets, eta: seen.update(critic=critic, targets=targets, eta=eta) or 1 / 0
@@ -430,9 +433,35 @@ def test_z_c_bootstraps_on(stage, bootstrap, shared_control, expected):
         if expected == "guided mode":
             actions, log_prob = model.actor(batch.next_observations, deterministic=True), 0 * log_prob
         q_values = model.confidence_critic_target(batch.next_observations, actions)[0].min(dim=0).values
-    y_q = batch.rewards[:, 0] + 0.5 * (1 - batch.dones[:, 0]) * (q_values - alpha * log_prob)
+    rewards = (batch.rewards - 3 * batch.costs)[:, 0]
+    y_q = rewards + 0.5 * (1 - batch.dones[:, 0]) * (q_values - alpha * log_prob)
     assert th.allclose(seen["targets"][0], y_q, atol=1e-6)
     assert seen["critic"] is model.confidence_critic
+
+
+class Scaled(gym.RewardWrapper):
+    """Rewards of another size."""
+
+    def __init__(self, env, factor):
+        super().__init__(env)
+        self.factor = factor
+
+    def reward(self, reward):
+        return self.factor * reward
+
+
+def test_stage_2_is_the_same_whatever_the_scale_of_the_reward():
+    """All curves of the training, and what is learned."""
+    learned = {}
+    for factor in (1.0, 0.01, 100.0):
+        set_random_seed(0)
+        model = make_chac(Scaled(Limited(), factor), switch_after=60, prefit_steps=20, learning_rate=1e-3, seed=0).learn(150)
+        assert model.stage == 2
+        learned[factor] = [predict(model, who) for who in ("self", "guided", "shared")], model.reward_square**0.5
+    actions, unit = learned[1.0]
+    for factor, (others, other_unit) in learned.items():
+        np.testing.assert_allclose(others, actions, atol=1e-3)
+        assert other_unit == pytest.approx(factor * unit, rel=1e-4)
 
 
 @pytest.mark.parametrize("anchor_coef", [0.0, 1.0, 1000.0])
@@ -508,7 +537,8 @@ def test_presets_fill_in_what_the_docstring_says(algorithm, preset):
 @pytest.mark.parametrize("preset", ["default", "paper"])
 @pytest.mark.parametrize("name", [*CHAC.presets["default"], "target_entropy"])
 def test_arguments_win_over_the_preset(name, preset):
-    others = {"bootstrap": ["self", "executed"], "bounded_targets": [False, True], "prefit_steps": [9, 10]}
+    booleans = {key: [False, True] for key in ("bounded_targets", "normalize_rewards")}
+    others = {"bootstrap": ["self", "executed"], "prefit_steps": [9, 10]} | booleans
     for value in others.get(name, [0.05, 0.06]):
         kwargs = {name: value}
         model = CHAC("MlpPolicy", Limited(), preset=preset, policy_kwargs=dict(net_arch=[8]), buffer_size=10, **kwargs)

@@ -11,9 +11,10 @@ import gymnasium as gym
 import numpy as np
 import pygame
 import pytest
-from cockpit_toys import Car, cockpit, wait_until
+from cockpit_toys import Car, cockpit
 from guided_toys import make_guided
 from gymnasium import spaces
+from shell import FOREVER, wait_until
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_chac import CHAC, DPVP, PVP, HGDagger
@@ -262,7 +263,7 @@ def test_unplugging_in_a_takeover_brakes_and_pauses(tmp_path):
     assert drive.paused  # nothing to take over with
     emulator.plug()
     drive.go_on()
-    thread.join(5)
+    thread.join(FOREVER)
     _, _, terminated, truncated, info = results[0]
     assert truncated and not terminated and info["unattended"]
     assert not drive.person.read().takeover
@@ -288,7 +289,7 @@ def test_losing_the_device_while_the_novice_drives_pauses_without_braking(tmp_pa
     wait_until(lambda: drive.paused)
     assert car.executed == []
     drive.quit()
-    thread.join(5)
+    thread.join(FOREVER)
     assert ended and car.executed == []
 
 
@@ -325,19 +326,19 @@ def test_as_many_updates_as_the_algorithm_makes(algorithm, tmp_path):
 
 def test_slow_updates_do_not_hold_up_the_drive(tmp_path):
     model, drive, _ = make_driven(DPVP, tmp_path, rate=50.0)
-    train_now = model.train_now
+    train_now, begun_at = model.train_now, []
 
     def slowly(*args):
-        time.sleep(0.25)
+        """As long as 12 steps: it would never be done if they waited for it."""
+        begun_at.append(drive.display.total_steps)
+        wait_until(lambda: drive.display.total_steps >= begun_at[-1] + 12 or drive.ended)
         train_now(*args)
+        if len(begun_at) >= 4:
+            drive.quit()
 
     model.train_now = slowly
-    timer = threading.Timer(1.5, drive.quit)
-    begun = time.monotonic()
-    timer.start()
     model.learn(10_000)
-    rate = model.num_timesteps / (min(time.monotonic() - begun, 1.5))
-    assert rate > 40 and drive.lag > 30  # one update takes as long as 12 steps
+    assert len(begun_at) >= 4 and np.diff(begun_at[:4]).min() >= 12 and drive.lag > 30
 
 
 def test_an_error_of_an_update_ends_the_drive(tmp_path):
@@ -355,15 +356,25 @@ def test_stage_2_is_prepared_beside_the_drive_and_the_person_may_still_take_over
     _, device, person = keyboard()
     model, drive, env = make_driven(CHAC, tmp_path, device, rate=100.0, switch_after=30, prefit_steps=20)
     prefit_step, prepared = model._prefit_step, []
+    step, step_of_car = 0, env.step  # of those that are made while stage 2 is prepared
 
     def witnessed():
-        time.sleep(0.01)  # a step of the environment takes as long
+        """While a step of the car is made, and after it."""
         prepared.append((threading.current_thread() is model.learner, drive.busy, drive.display.total_steps))
         if len(prepared) == 10:
             person.tap(pygame.K_SPACE)
+        wait_until(lambda: drive.display.total_steps > prepared[-1][2])
         prefit_step()
 
-    model._prefit_step = witnessed
+    def in_turn(action):
+        """However slow the learner is, the car is at most one step ahead."""
+        nonlocal step
+        if model.prefit_left:
+            wait_until(lambda: not model.prefit_left or step <= len(prepared))
+            step += 1
+        return step_of_car(action)
+
+    model._prefit_step, env.step = witnessed, in_turn
     model.learn(80)
     assert model.stage == 2 and len(prepared) == 20 and model.owed_steps == 0
     assert all(is_beside and not busy for is_beside, busy, _ in prepared)
@@ -398,7 +409,7 @@ def test_the_unattended_brake_is_not_learned_from(tmp_path):
     emulator.unplug()
     wait_until(lambda: drive.paused)
     drive.quit()
-    thread.join(10)
+    thread.join(FOREVER)
     summary = env.recorder.finish()
     assert model.replay_buffer.size() == summary.steps
     assert (model.replay_buffer.human.arrays["action"][: summary.human_steps, 1] == 0).all()  # the person did not brake

@@ -7,22 +7,23 @@ import re
 import shutil
 import signal
 import socket
+import ssl
 import subprocess
 import sys
 import threading
-import time
-from contextlib import asynccontextmanager, contextmanager
+from contextlib import asynccontextmanager, contextmanager, suppress
 
 import aiohttp
 import numpy as np
 import pytest
-from cockpit_toys import Car, cockpit, wait_until
+from cockpit_toys import Car, cockpit
+from shell import FOREVER, wait_until
 
 from sb3_chac.__main__ import main
 from sb3_chac.cockpit import server as server_module
-from sb3_chac.cockpit.browser import Address, BadMessage, Browser, Held, Wish, parse, parse_address
+from sb3_chac.cockpit.browser import STALE, Address, BadMessage, Browser, Held, Wish, parse, parse_address
 from sb3_chac.cockpit.env import STANDS
-from sb3_chac.cockpit.server import MOST_CONNECTIONS, MOST_VIEWERS, Server
+from sb3_chac.cockpit.server import MOST_CONNECTIONS, MOST_MESSAGES, MOST_REQUESTS, MOST_VIEWERS, Server, tls_context
 from sb3_chac.cockpit.session import DriveEnded
 
 NOVICE = np.array([0.25, 0.0], np.float32)
@@ -30,18 +31,23 @@ CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", 
 
 
 class Served:
-    """A drive of a ``Car`` at 50 steps per second, and its server, in threads of their own."""
+    """
+    A drive of a ``Car`` at 50 steps per second, and its server, in threads of their own.
 
-    def __init__(self, folder):
-        self.device = Browser()
+    The clock by which its driver falls silent is no wall clock: it goes on with what the driver says, see ``Driver``.
+    """
+
+    def __init__(self, folder, tls=None):
+        self.now = 0.0
+        self.device = Browser(lambda: self.now)
         self.env, self.drive, self.car = cockpit(folder, self.device, Car(length=10**6), rate=50.0)
-        self.server = Server(self.drive, self.device, Address("127.0.0.1", 0))
+        self.server = Server(self.drive, self.device, Address("127.0.0.1", 0), tls, clock=lambda: self.now)
         self.is_served = threading.Event()
         self.threads = [threading.Thread(target=self.run), threading.Thread(target=lambda: asyncio.run(self.serve()))]
         for thread in self.threads:
             thread.start()
-        assert self.is_served.wait(10)
-        self.origin = f"http://127.0.0.1:{self.server.address.port}"
+        assert self.is_served.wait(FOREVER)
+        self.origin = f"{self.server.scheme}://127.0.0.1:{self.server.address.port}"
 
     def run(self):
         self.env.env.arm()
@@ -62,7 +68,7 @@ class Served:
     def stop(self):
         self.drive.quit()
         for thread in self.threads:
-            thread.join(10)
+            thread.join(FOREVER)
             assert not thread.is_alive()
 
     @property
@@ -79,28 +85,37 @@ class Served:
 
 
 @pytest.fixture
-def served(tmp_path):
+def served(tmp_path, monkeypatch, request):
+    """Nobody is dropped because the machine is slow, unless the parameter says after how many seconds."""
+    monkeypatch.setattr(server_module, "HEARTBEAT", None)
+    monkeypatch.setattr(server_module, "PATIENCE", getattr(request, "param", FOREVER))
     drive = Served(tmp_path)
     yield drive
     drive.stop()
 
 
 class Driver:
-    """Sits at the wheel of a drive: tells what it holds every 20 ms, as the page does, until it is silent."""
+    """
+    Sits at the wheel of a drive: tells what it holds every 20 ms, as the page does, until it is silent.
 
-    def __init__(self, channel):
-        self.channel, self.keys, self.silent = channel, [], False
+    :param served: its clock goes on meanwhile, but waits for what is still on its way, however slow the machine is
+    """
+
+    def __init__(self, channel, served=None):
+        self.channel, self.served, self.keys, self.silent = channel, served, [], False
 
     async def tell(self):
         while not self.silent:
             await self.channel.send_json({"keys": self.keys, "gamepad": None})
             await asyncio.sleep(0.02)
+            if self.served is not None and self.served.now - self.served.device.heard_at < STALE / 3:
+                self.served.now += 0.02
 
 
 @asynccontextmanager
 async def driving(served):
     async with served.viewer() as channel:
-        driver = Driver(channel)
+        driver = Driver(channel, served)
         task = asyncio.create_task(driver.tell())
         try:
             await until(lambda: served.drive.person.read().connected)
@@ -111,8 +126,8 @@ async def driving(served):
             task.cancel()
 
 
-async def until(condition, seconds=10.0):
-    await asyncio.to_thread(wait_until, condition, seconds)
+async def until(condition):
+    await asyncio.to_thread(wait_until, condition)
 
 
 async def goes_on(served):
@@ -123,7 +138,7 @@ async def goes_on(served):
 async def state_of(channel, wanted=lambda state: True):
     """The first state that is wanted."""
     while True:
-        message = await asyncio.wait_for(channel.receive(), 10)
+        message = await asyncio.wait_for(channel.receive(), FOREVER)
         if message.type is aiohttp.WSMsgType.TEXT and wanted(state := json.loads(message.data)):
             return state
 
@@ -131,7 +146,7 @@ async def state_of(channel, wanted=lambda state: True):
 async def closed(channel):
     """The code with which it was closed."""
     while not channel.closed:
-        await asyncio.wait_for(channel.receive(), 10)
+        await asyncio.wait_for(channel.receive(), FOREVER)
     return channel.close_code
 
 
@@ -160,6 +175,9 @@ BAD = [
     '{"keys": [], "gamepad": [2, 0, 0]}',
     '{"keys": [], "gamepad": [true, 0, 0]}',
     '{"keys": [], "gamepad": [0, 0]}',
+    '{"keys": [], "gamepad": [1' + "0" * 500 + ", 0, 0]}",
+    '{"ping": 1' + "0" * 500 + "}",
+    '{"ping": 1' + "0" * 5000 + "}",
     '{"wish": "format"}',
     '{"wish": ["quit"]}',
     '{"ping": -1}',
@@ -223,7 +241,7 @@ def test_keys_drive_and_space_hands_back(served):
 def test_viewers_get_pictures(served):
     async def look():
         async with driving(served), served.viewer(served.server.spectator_token) as channel:
-            while (message := await asyncio.wait_for(channel.receive(), 10)).type is not aiohttp.WSMsgType.BINARY:
+            while (message := await asyncio.wait_for(channel.receive(), FOREVER)).type is not aiohttp.WSMsgType.BINARY:
                 pass
             assert message.data.startswith(b"\xff\xd8\xff")  # JPEG
 
@@ -242,7 +260,12 @@ def test_a_lost_driver_in_a_takeover_brakes_and_pauses(served, loss):
                 await driver.channel.send_json({"wish": "away"})
             elif loss == "closed":
                 await driver.channel.close()
-            await until(lambda: served.drive.paused)
+
+            def is_lost():
+                served.now += 0.02 * (loss == "stale")
+                return served.drive.paused
+
+            await until(is_lost)
             assert served.car.speed < STANDS and served.drive.message.startswith("Braked. Nobody is at the wheel")
             assert not served.drive.person.read().takeover
         async with driving(served):  # somebody else sits down, and P goes on
@@ -313,11 +336,25 @@ def test_page_and_token(served):
         code, page, headers = await status(served, f"/?token={token}")
         assert code == 200 and "cockpit.js" in page
         assert "default-src 'none'" in headers["Content-Security-Policy"] and headers["Referrer-Policy"] == "no-referrer"
-        for path in ("/", "/?token=", "/?token=x", f"/?token={token}x", "/?token=%ff", "/ws", "/ws?token=x"):
+        assert f"cockpit.js?token={token}" in page and f"cockpit.css?token={token}" in page
+        for name in ("cockpit.js", "cockpit.css"):
+            assert (await status(served, f"/{name}?token={token}"))[0] == 200
+        paths = ("/", "/?token=", "/?token=x", f"/?token={token}x", "/?token=%ff", "/ws", "/ws?token=x", "/cockpit.js")
+        for path in (*paths, "/cockpit.css"):
             code, text, _ = await status(served, path, {"Origin": served.origin})
             assert code == 403 and "access token is missing or wrong" in text
         assert (await status(served, "/../server.py"))[0] == 404
-        for host in ("evil.example", "evil.example:80", "127.0.0.1.evil.example"):
+        for host in (
+            "evil.example",
+            "evil.example:80",
+            "127.0.0.1.evil.example",
+            "[",
+            "]",
+            "[::1",
+            "a b",
+            "1" * 500,
+            ":" * 90,
+        ):
             code, text, _ = await status(served, f"/?token={token}", {"Host": host})
             assert code == 403 and "host name is not served" in text
         async with driving(served):
@@ -354,16 +391,44 @@ def test_bad_messages_end_the_connection_and_not_the_drive(served, text, code):
     asyncio.run(say())
 
 
-def test_a_flood_of_messages(served):
+@pytest.mark.parametrize("frame", ["message", "ping", "pong"])
+def test_a_flood_of_messages(served, frame):
     async def flood():
-        async with driving(served):
+        async with driving(served) as driver:
+            driver.silent = True  # the clock stands still: it is a flood however slow the machine is
             async with served.viewer() as channel:
-                for number in range(300):
-                    await channel.send_json({"ping": number})
+                send = {"message": lambda: channel.send_json({"ping": 1}), "ping": channel.ping, "pong": channel.pong}[frame]
+                with suppress(ConnectionError):
+                    for _ in range(MOST_MESSAGES + 20):
+                        await send()
                 assert await closed(channel) == 1008
             await goes_on(served)
 
     asyncio.run(flood())
+
+
+def test_a_flood_of_requests_without_a_token(served):
+    async def flood():
+        async with driving(served) as driver:
+            driver.silent = True
+            codes = [(await status(served, "/?token=x"))[0] for _ in range(MOST_REQUESTS + 5)]
+            assert codes[0] == 403 and codes[-1] == 429
+            await goes_on(served)
+
+    asyncio.run(flood())
+
+
+def test_who_is_refused_or_dropped_is_logged_without_a_token(served, caplog):
+    async def come():
+        token = served.server.driver_token
+        assert (await status(served, f"/?token={token}x"))[0] == 403
+        async with driving(served), served.viewer() as channel:
+            await channel.send_str("{")
+            await closed(channel)
+            await until(lambda: "dropped the viewer at 127.0.0.1: no JSON" in caplog.text)
+        assert "refused '/'" in caplog.text and token not in caplog.text
+
+    asyncio.run(come())
 
 
 def test_too_many_viewers(served):
@@ -384,26 +449,23 @@ def test_too_many_viewers(served):
     asyncio.run(crowd())
 
 
-def test_a_flood_of_connections(served, monkeypatch):
-    monkeypatch.setattr(server_module, "PATIENCE", 1.0)
-
+@pytest.mark.parametrize("served", [1.0], indirect=True)
+def test_a_flood_of_connections(served):
     async def flood():
         async with driving(served):
             address = ("127.0.0.1", served.server.address.port)
 
             def connect_often():  # not in the thread in which the driver tells what it holds
-                return [socket.create_connection(address, timeout=5) for _ in range(3 * MOST_CONNECTIONS)]
+                return [socket.create_connection(address, timeout=FOREVER) for _ in range(3 * MOST_CONNECTIONS)]
 
             sockets = await asyncio.to_thread(connect_often)
             await goes_on(served)
             # Those that ask for nothing are closed, and others come in again
-            end = time.monotonic() + 20
             while True:
                 try:
-                    assert (await status(served, "/cockpit.js"))[0] == 200
+                    assert (await status(served, "/cockpit.js"))[0] == 403
                     break
                 except aiohttp.ClientError:
-                    assert time.monotonic() < end
                     await asyncio.sleep(0.1)
             for connection in sockets:
                 connection.close()
@@ -450,7 +512,7 @@ def test_drive_in_a_browser_and_sigterm_saves(tmp_path):
         assert "Watch at" in process.stdout.readline()
         asyncio.run(play(url))
         printed = process.stdout.read()
-        assert process.wait(60) == 0
+        assert process.wait(FOREVER) == 0
     assert "in 1 takeovers" in printed and "sb3-chac drive --resume logs/pvp/SafeDrive-v0_1" in printed
     assert list((tmp_path / "logs/pvp/SafeDrive-v0_1/checkpoints").glob("*/replay_buffer.pkl"))
 
@@ -472,21 +534,53 @@ def test_wrong_arguments_get_one_message(arguments, message, tmp_path, monkeypat
     assert ended.value.code == 2 and message in capsys.readouterr().err
 
 
+def test_an_encrypted_cockpit(tmp_path):
+    certificate, key = tmp_path / "cert.pem", tmp_path / "key.pem"
+    make = ["openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "2", "-subj", "/CN=localhost"]
+    subprocess.run([*make, "-out", certificate, "-keyout", key], check=True, capture_output=True)
+    served = Served(tmp_path, tls_context(certificate, key))
+
+    async def look():
+        trusted = ssl.create_default_context(cafile=certificate)
+        trusted.check_hostname = False
+        async with aiohttp.ClientSession(connector=aiohttp.TCPConnector(ssl=trusted)) as session:
+            page = served.server.url(served.server.spectator_token)
+            async with session.get(page) as response:
+                assert response.status == 200 and "wss://" in response.headers["Content-Security-Policy"]
+            address = page.replace("/?", "/ws?")
+            async with session.ws_connect(address, headers={"Origin": served.origin}, max_msg_size=0) as channel:
+                assert (await state_of(channel))["role"] == "spectator"
+
+    try:
+        assert served.origin.startswith("https://")
+        asyncio.run(look())
+    finally:
+        served.stop()
+
+
+@pytest.mark.parametrize("content", ["", "no certificate"])
+def test_a_certificate_that_cannot_be_used(tmp_path, content):
+    (tmp_path / "cert.pem").write_text(content)
+    with pytest.raises(ValueError, match="--tls-cert"):
+        tls_context(tmp_path / "cert.pem", None)
+
+
 @pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium")
 def test_in_chromium(served):
     from playwright.sync_api import sync_playwright
 
     complaints = []
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"], timeout=1000 * FOREVER)
         page = browser.new_page()
+        page.set_default_timeout(1000 * FOREVER)
         page.on("console", lambda message: complaints.append(message.text) if message.type == "error" else None)
         page.on("pageerror", lambda error: complaints.append(str(error)))
 
         def shows(element, text):
             wait_until(lambda: page.inner_text(f"#{element}") == text)
 
-        page.goto(served.server.address.url(served.server.driver_token))
+        page.goto(served.server.url(served.server.driver_token))
         shows("role", "You are at the wheel")
         page.keyboard.press("KeyP")
         shows("takeover-value", "no")

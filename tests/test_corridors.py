@@ -9,13 +9,16 @@ from sb3_chac.envs.driving.corridors import (
     ARC_HALF_WIDTHS,
     CURVATURES,
     FAR,
+    FASTEST,
     LATERALS,
     N_ARCS,
     N_CORRIDORS,
+    N_VIEW,
     STRIP_HALF_WIDTHS,
     Corridors,
+    CorridorView,
 )
-from sb3_chac.envs.safedrive.env import route_ahead
+from sb3_chac.envs.safedrive.navigation import route_ahead
 
 RAYS, REACH = 240, 50.0
 STRAIGHT = np.stack([np.arange(51.0), np.zeros(51)], axis=1), np.zeros(51)
@@ -113,7 +116,7 @@ def test_strips_follow_the_route() -> None:
 def test_they_are_what_their_definition_says(scenario: int) -> None:
     for observation in observations_of(scenario, 60)[::10]:
         expected = reference(observation[19:259], *route_ahead(observation))
-        np.testing.assert_allclose(observation[259:], expected, atol=2e-5)
+        np.testing.assert_allclose(observation[259 : 259 + N_CORRIDORS], expected, atol=2e-5)
 
 
 def test_a_mirrored_world_gives_mirrored_corridors() -> None:
@@ -139,16 +142,50 @@ def test_they_are_bounded_and_finite_whatever_is_observed() -> None:
     assert np.isfinite(everything).all() and everything.min() >= 0 and everything.max() <= 1
 
 
-def test_the_same_observation_in_another_world_gives_the_same_corridors() -> None:
-    seen, elsewhere = observations_of(2000, 40)[-1], gym.make("SafeDrive-v0", blocks="OX", traffic_density=3.0).unwrapped
+def test_the_same_observations_in_another_world_give_the_same_corridors() -> None:
+    seen, elsewhere = observations_of(2000, 40), gym.make("SafeDrive-v0", blocks="OX", traffic_density=3.0).unwrapped
     elsewhere.reset(options={"scenario": 7})
-    again = elsewhere._corridors(seen[19:259], *route_ahead(seen))
-    np.testing.assert_array_equal(again.astype(np.float32), seen[259:])
+    elsewhere._corridors.reset()
+    for observation in seen:
+        again = elsewhere._corridors(observation[19:259], *route_ahead(observation))
+        np.testing.assert_array_equal(again.astype(np.float32), observation[259:])
+
+
+def test_what_stands_comes_nearer_and_what_drives_along_does_not() -> None:
+    view, step = CorridorView(RAYS, REACH), 0.9
+    first = view(scan((20.0, 0.0), (10.0, 3.0)), *STRAIGHT)
+    assert not first[N_CORRIDORS:].any()  # nothing is known yet
+    change = view(scan((20.0 - step, 0.0), (10.0, 3.0)), *STRAIGHT)[N_CORRIDORS:]
+    strips = change[N_ARCS:].reshape(len(STRIP_HALF_WIDTHS), -1)
+    assert strips[:, LATERALS == 0] == pytest.approx(-step / FASTEST)
+    assert not strips[:, LATERALS > 2.0].any()
+    view.reset()
+    assert not view(scan((5.0, 0.0)), *STRAIGHT)[N_CORRIDORS:].any()
+
+
+def test_changes_are_bounded() -> None:
+    view = CorridorView(RAYS, REACH)
+    view(scan((30.0, 0.0)), *STRAIGHT)
+    appears = view(scan((5.0, 0.0)), *STRAIGHT)[N_CORRIDORS:]
+    gone = view(np.zeros(RAYS), *STRAIGHT)[N_CORRIDORS:]
+    assert appears.min() == -1 and gone.max() == 1 and np.abs(np.concatenate([appears, gone])).max() == 1
+
+
+def test_an_episode_begins_without_changes() -> None:
+    env = gym.make("SafeDrive-v0").unwrapped
+    for scenario in (2000, 2001):
+        observation, _ = env.reset(options={"scenario": scenario})
+        assert not observation[259 + N_CORRIDORS :].any()
+        changed = False
+        for _ in range(60):
+            observation, *_ = env.step(np.array([0.0, 0.5]))
+            changed |= bool(observation[259 + N_CORRIDORS :].any())
+        assert changed
 
 
 def test_without_them_the_observation_is_the_plain_one() -> None:
     with_them, plain = (gym.make("SafeDrive-v0", corridors=flag) for flag in (True, False))
-    assert with_them.observation_space.shape == (259 + N_CORRIDORS,) and plain.observation_space.shape == (259,)
+    assert with_them.observation_space.shape == (259 + N_VIEW,) and plain.observation_space.shape == (259,)
     full, _ = with_them.reset(options={"scenario": 2000})
     short, _ = plain.reset(options={"scenario": 2000})
     np.testing.assert_array_equal(full[:259], short)

@@ -1,6 +1,7 @@
 """DualReplayBuffer: which transition stands where, what a batch is made of, and what returns of several steps add up to."""
 
 import io
+import pickle
 
 import numpy as np
 import pytest
@@ -413,3 +414,30 @@ def test_a_buffer_takes_steps_of_more_environments_than_before():
     add(buffer, 1, reward=2, done=True)
     assert returns(buffer.novice, env=0) == [(0, 2, 2, 0.25, 1), (1, 2, 2, 0.5, 1)]
     assert returns(buffer.novice, env=1) == [(1, 2, 2, 0.5, 1)]
+
+
+@pytest.mark.parametrize("n_steps, expected", [(1, [1.0, 0.0, 2.0]), (2, [1.0, GAMMA * 2.0, 2.0])])
+def test_costs_are_kept_and_summed_up_as_rewards_are(n_steps, expected):
+    buffer = make_buffer(n_steps=n_steps)
+    for t, cost in enumerate([1.0, 0.0, 2.0]):
+        obs = np.array([[t, 0]], np.float32)
+        buffer.add(obs, obs + 1, obs / 100, np.zeros(1), np.array([t == 2]), [{"cost": cost}])
+    assert [cost for (cost,) in rows(buffer.novice, "cost")] == expected
+    assert set(buffer.sample(50).costs.flatten().tolist()) == set(expected)
+
+
+@pytest.mark.parametrize("n_steps", [1, 3])
+def test_a_buffer_of_an_older_version_has_no_costs(n_steps):
+    buffer = make_buffer(n_steps=n_steps)
+    fill(buffer, novice=5, human=5)
+    for store in (buffer.novice, buffer.human):
+        store.columns = {name: column for name, column in store.columns.items() if name != "cost"}
+        del store.arrays["cost"]
+    for row in buffer.pending[0]:
+        row.pop("cost")
+    older = pickle.loads(pickle.dumps(buffer))
+    assert not older.sample(20).costs.any()
+    for t in range(5, 10):
+        add(older, t)
+    older.end_trajectories()
+    assert times(older.novice) == list(range(10))

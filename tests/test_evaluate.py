@@ -2,6 +2,7 @@
 
 import csv
 import json
+import os
 import pickle
 import sys
 from pathlib import Path
@@ -18,8 +19,10 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_chac import DSAC
 from sb3_chac.common.evaluation import evaluate, scenario_list
+from sb3_chac.demos import main as demos
 from sb3_chac.evaluate import find_algorithm
 from sb3_chac.evaluate import main as command
+from sb3_chac.human.demonstrations import load_demonstrations
 
 TOY = "toy_env:ToyDrive-v0"
 QUICK = {"learning_starts": 10, "buffer_size": 100, "seed": 0}
@@ -166,7 +169,7 @@ def test_recurrent_policy_remembers_within_an_episode_only():
     np.testing.assert_allclose(np.diff(path.positions[:, 0]), actions, atol=1e-6)
 
 
-def test_observations_are_normalized_as_in_training(tmp_path, capsys):
+def test_observations_are_normalized_as_in_training(tmp_path, capsys, monkeypatch):
     env = VecNormalize(DummyVecEnv([toy_env.ToyDrive]))
     model = SAC("MlpPolicy", env, **QUICK).learn(20)
     env.obs_rms.mean[:] = 5.0
@@ -185,6 +188,15 @@ def test_observations_are_normalized_as_in_training(tmp_path, capsys):
     result = json.loads((tmp_path / "result.json").read_text())
     assert result["records"] == expected.records and result["normalized"]
     assert evaluate(model, TOY, "0:2", jobs=2).records == expected.records
+    # At their defaults, the commands take as many processes as there are cores
+    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {0, 1}, raising=False)
+    options = ["--env", TOY, "--scenarios", "0:2", "--json", str(tmp_path / "result.json")]
+    command([str(folder / "best_model.zip"), *options])
+    assert json.loads((tmp_path / "result.json").read_text())["records"] == expected.records
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "datasets"))
+    for name, jobs in (("default-v0", []), ("one-v0", ["--jobs", "1"])):
+        demos(["record", "--expert", str(folder / "best_model.zip"), "--env", TOY, "--steps", "20", "--dataset", name, *jobs])
+    assert np.array_equal(*(load_demonstrations(name).actions for name in ("default-v0", "one-v0")))
 
 
 def test_more_scenarios_than_panels_and_a_gif(tmp_path, capsys):

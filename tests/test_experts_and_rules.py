@@ -2,12 +2,15 @@
 
 import functools
 import math
+import queue
+import threading
 
 import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
 from gymnasium.error import ResetNeeded
+from shell import wait_until
 from stable_baselines3 import SAC
 from takeover_toys import (
     EXPERT,
@@ -23,6 +26,7 @@ from takeover_toys import (
     drive,
 )
 
+from sb3_chac import CHAC, DPVP, IWR, PVP, HGDagger
 from sb3_chac.human import (
     ControlState,
     DisagreementRule,
@@ -30,6 +34,7 @@ from sb3_chac.human import (
     InterventionWrapper,
     ModelExpert,
     RiskRule,
+    RuleError,
     make_expert,
     make_rule,
 )
@@ -128,7 +133,7 @@ def test_a_rule_that_raises():
 
     env = armed(rule)
     drive(env, 1)
-    with pytest.raises(ZeroDivisionError):
+    with pytest.raises(RuleError, match="rule raised ZeroDivisionError"):
         env.step(NOVICE)
     assert len(env.unwrapped.executed) == 1 and env.state is ControlState.AUTONOMOUS and env.total_steps == 1
     with pytest.raises(ResetNeeded):
@@ -138,9 +143,9 @@ def test_a_rule_that_raises():
 
 
 def test_rules_must_answer_true_or_false():
-    with pytest.raises(TypeError, match="rule must return True or False, got None"):
+    with pytest.raises(RuleError, match=r"rule .* must return True or False, got None"):
         drive(armed(lambda *args: None), 1)
-    with pytest.raises(ValueError, match="NaN"):
+    with pytest.raises(RuleError, match="NaN"):
         drive(armed(risky([math.nan])), 1)
 
 
@@ -299,7 +304,7 @@ def test_bad_arguments_of_risk_rule(name, value):
 
 @pytest.mark.parametrize("threshold, space", [(-0.1, Integrator.action_space), (0.1, spaces.Discrete(2))])
 def test_bad_arguments_of_disagreement_rule(threshold, space):
-    with pytest.raises(ValueError, match=r"threshold|action space"):
+    with pytest.raises(ValueError, match=r"threshold|action.space"):
         DisagreementRule(threshold, space)
 
 
@@ -320,3 +325,62 @@ def test_rules_can_be_configured():
         InterventionWrapper(env, rule_kwargs={"hold": 0})
     with pytest.raises(ValueError, match=r"^rule_kwargs: only 'risk' and 'disagreement' take any, got rule='never'"):
         InterventionWrapper(env, rule="never", rule_kwargs={"hold": 4})
+
+
+# Deadlines and failures of both, while learning
+
+
+asleep = threading.Event()
+
+
+def never_answers(*args):
+    asleep.set()
+    threading.Event().wait()
+
+
+class Answers(queue.Queue):
+    """Of a thread: the time is over as soon as it sleeps, and not before, however slow the machine is."""
+
+    def get(self, timeout):
+        wait_until(lambda: self.qsize() or asleep.is_set())
+        return super().get(block=False)
+
+
+def not_in_time(*args):
+    raise KeyError("lost")
+
+
+@pytest.mark.parametrize(
+    "expert, rule, error, problem",
+    [
+        (never_answers, "always", ExpertError, "expert never_answers .*no answer within 0.2 s"),
+        (constant, never_answers, RuleError, "rule never_answers .*no answer within 0.2 s"),
+        (not_in_time, "always", ExpertError, "expert not_in_time raised KeyError: 'lost'"),
+        (constant, not_in_time, RuleError, "rule not_in_time raised KeyError: 'lost'"),
+        (lambda observation: [np.nan, 0], "always", ExpertError, "NaN or infinite"),
+        (lambda observation: [0.1], "always", ExpertError, r"returned shape \(1,\)"),
+        (constant, lambda *args: np.nan, RuleError, "must return True or False, got nan"),
+        (constant, lambda *args: [True], RuleError, r"must return True or False, got \[True\]"),
+    ],
+)
+@pytest.mark.parametrize("algorithm", [PVP, DPVP, CHAC, HGDagger, IWR])
+def test_who_fails_is_named_and_the_model_can_be_saved(tmp_path, monkeypatch, algorithm, expert, rule, error, problem):
+    asleep.clear()
+    monkeypatch.setattr("sb3_chac.human.experts.queue.SimpleQueue", Answers)
+    env = InterventionWrapper(Integrator(), expert=expert, rule=rule, deadline=0.2)
+    model = algorithm("MlpPolicy", env, buffer_size=50, policy_kwargs={"net_arch": [8]})
+    if algorithm in (HGDagger, IWR):
+        model.warm_up_steps = 0  # there the rule is "always"
+    with pytest.raises(error, match=problem):
+        model.learn(20)
+    model.save(tmp_path / "model")
+    model.save_replay_buffer(tmp_path / "buffer")
+    assert algorithm.load(tmp_path / "model").num_timesteps == model.num_timesteps
+
+
+def test_an_action_that_cannot_be_written_to_is_one():
+    action = np.array([0.5, 0.25])
+    action.flags.writeable = False
+    env = InterventionWrapper(Integrator(), expert=lambda observation: action, rule="always", armed=True)
+    env.reset(seed=0)
+    assert np.allclose(env.step(NOVICE)[4]["applied_action"], action)

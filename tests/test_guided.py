@@ -116,10 +116,7 @@ class SelfDriven(Limited):
 @each_algorithm
 def test_environments_that_do_the_takeovers_themselves(algorithm):
     model = make_guided(algorithm, DummyVecEnv([lambda: SelfDriven(low=-2, high=2, limit=7)]))
-    with pytest.warns(
-        UserWarning, match=f"{algorithm.__name__}: no human is in the loop.*InterventionWrapper.*intervene_action"
-    ):
-        model.learn(12)
+    model.learn(12)
     novice, human = stores(model)
     assert column(human, "reward").tolist() == [3, 4, 7, 3, 4]
     assert column(human, "takeover_start").tolist() == [1, 0, 1, 1, 0]
@@ -134,7 +131,7 @@ def test_environments_that_do_the_takeovers_themselves(algorithm):
 @each_algorithm
 def test_a_takeover_without_the_action_that_was_executed_is_refused(algorithm):
     env = DummyVecEnv([lambda: Limited(infos={"takeover": True})])
-    with pytest.warns(UserWarning), pytest.raises(ValueError, match=r"info\['takeover'\] .*environment 0.*applied_action"):
+    with pytest.raises(ValueError, match=r"info\['takeover'\] .*environment 0.*applied_action"):
         make_guided(algorithm, env).learn(3)
 
 

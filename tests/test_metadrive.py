@@ -8,6 +8,7 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.utils.env_checker import check_env
 from shell import run
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 from stable_baselines3.common.env_util import make_vec_env
@@ -59,12 +60,12 @@ def parked_vehicle(env):
 
 @needs_metadrive
 def test_checkers_of_gymnasium_and_sb3():
-    # gymnasium's check_env wants rewards to repeat to the last bit, MetaDrive's repeat to 1e-6
     env = gym.make("MetaDriveSafety-v0")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             sb3_check_env(env)
+            check_env(env.unwrapped, skip_render_check=True, skip_close_check=True)  # closing: below
     finally:
         env.close()
 
@@ -76,18 +77,17 @@ def test_observations_are_scaled(env):
     env.simulator.reset = lambda **kwargs: own.append(observe(**kwargs)) or own[-1]
     observation, _ = env.reset(options={"scenario": 100})
     raw = np.clip(own[0][0], 0, 1)
-    np.testing.assert_allclose(observation[19:], 1 - raw[19:], atol=1e-6)  # closeness
+    np.testing.assert_allclose(observation[19:259], 1 - raw[19:], atol=1e-6)  # closeness
     np.testing.assert_allclose(observation[3], (raw[3] - 0.75) / 0.2, rtol=1e-4)  # speed
     assert env.observation_space.contains(observation)
     low, high = env.observation_space.low, env.observation_space.high
     np.testing.assert_allclose(low[3], -0.75 / 0.2)
     np.testing.assert_allclose([low[19], high[19]], [0, 1])
-    env.raw_observations = True
-    observation, _ = env.reset(options={"scenario": 100})
-    np.testing.assert_allclose(observation, raw, atol=1e-4)
     env.close()
     env = MetaDriveSafetyEnv(raw_observations=True, headless=True)
     assert (env.observation_space.low == 0).all() and (env.observation_space.high == 1).all()
+    observation, _ = env.reset(options={"scenario": 100})
+    np.testing.assert_allclose(observation, raw, atol=1e-4)
     env.close()
 
 
@@ -127,25 +127,48 @@ def test_scenarios_are_drawn_from_their_range_and_can_be_named(env):
             env.reset(options={"scenario": wrong})
 
 
+def wild_drive(env, scenario, steps=130):
+    """Observations, rewards and ends."""
+    observation, _ = env.reset(options={"scenario": scenario})
+    rows, rng = [observation], np.random.default_rng(0)
+    for action in np.clip(rng.normal((0.0, 0.4), 0.2, (steps, 2)), -1, 1):
+        observation, *rest, _ = env.step(action)
+        rows.append(np.append(observation, rest))
+    return np.concatenate(rows)
+
+
+def crash(env, scenario):
+    """The same, of running into a vehicle that stands, and on."""
+    env.reset(options={"scenario": scenario})
+    things = env.simulator.engine.get_objects().values()
+    place(env, next(thing for thing in things if getattr(thing, "break_down", False)), gap=6.5, speed=5.0)
+    rows = []
+    for action in [(0.0, 0.5)] * 30 + [(0.5, 1.0)] * 30:
+        observation, *rest, info = env.step(np.array(action))
+        rows.append(np.append(observation, rest))
+    assert info["episode_cost"] > 0
+    return np.concatenate(rows)
+
+
 @needs_metadrive
-def test_same_scenario_and_actions_give_the_same_episode(env):
-    rng = np.random.default_rng(0)
-    actions = np.clip(rng.normal((0.0, 0.4), 0.2, (80, 2)), -1, 1)
-
-    def rewards():
-        env.reset(options={"scenario": 3005})
-        return [env.step(action)[1] for action in actions]
-
-    first = rewards()
-    env.reset(options={"scenario": 3006})
-    assert np.allclose(first, rewards(), atol=1e-5)
+@pytest.mark.parametrize("drive", [wild_drive, crash])
+def test_an_episode_repeats_to_the_digit_whatever_came_before(env, drive):
+    scenario = 1006
+    if drive is crash:
+        parked_vehicle(env)
+        scenario = env.scenario
+    first = drive(env, scenario)
+    for before in (lambda: None, lambda: wild_drive(env, 1003, 300), lambda: crash(env, env.scenario)):
+        parked_vehicle(env)
+        before()
+        np.testing.assert_array_equal(drive(env, scenario), first)
 
 
 @pytest.mark.parametrize(
     "argument",
     [
         {"preset": "paper"}, {"start_scenario": -1}, {"num_scenarios": 0}, {"traffic_density": 2.0}, {"max_speed": 0.0},
-        {"horizon": 0}, {"render_mode": "3d"},
+        {"horizon": 0}, {"contact_limit": 0}, {"render_mode": "3d"},
     ],
 )  # fmt: skip
 def test_arguments_out_of_range(argument):
@@ -220,6 +243,19 @@ def test_collision_replaces_the_reward(env):
         if info["contact"]:
             break
     assert reward == -5.0
+
+
+@needs_metadrive
+@pytest.mark.parametrize(
+    ("limit", "every", "end"),  # steps between two touches, step at which the episode is truncated
+    [(30, 1, 30), (30, 8, 40), (30, 15, None), (None, 1, None)],
+)
+def test_a_contact_that_lasts_truncates_the_episode(env, monkeypatch, limit, every, end):
+    env.contact_limit = limit
+    env.reset(options={"scenario": 3003})
+    monkeypatch.setattr(env, "_touching", lambda vehicles, objects: {"somebody"} if env.steps % every == 0 else set())
+    ends = [env.step(np.zeros(2))[2:4] for _ in range(end or 60)]
+    assert ends[:-1] == [(False, False)] * (len(ends) - 1) and ends[-1] == (False, end is not None)
 
 
 @needs_metadrive
@@ -378,3 +414,11 @@ def test_the_installation_is_left_as_it_was():
     code = "from sb3_chac.envs.metadrive import MetaDriveSafetyEnv as E; e = E(headless=True); e.reset(); e.close()"
     subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
     assert {path for path in package.rglob("*") if "__pycache__" not in path.parts} == before
+
+
+@pytest.mark.parametrize("action", [[np.nan, 0], [0, np.inf], [0], "left"])
+def test_actions_that_are_none_do_not_move_the_car(env, action):
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match=r"^action must be two finite numbers.*did not make a step"):
+        env.step(action)
+    assert env.steps == 0

@@ -6,23 +6,28 @@ import signal
 import subprocess
 import sys
 import sysconfig
-import time
 import warnings
 import zipfile
 from pathlib import Path
 
 import numpy as np
 import pytest
-from shell import clean_environment, run
+from shell import clean_environment, run, wait_until
 from stable_baselines3.common.callbacks import ConvertCallback
 from stable_baselines3.common.save_util import load_from_pkl
 
 from sb3_chac import CHAC, DPVP, DSAC
-from sb3_chac.common.checkpoints import ResumableCheckpoint, SparseWriter, checkpoint_step, newest_checkpoint
+from sb3_chac.common.checkpoints import (
+    ResumableCheckpoint,
+    SparseWriter,
+    checkpoint_step,
+    checkpoints,
+    newest_checkpoint,
+)
 from sb3_chac.envs.safedrive import SafeDriveEnv
 from sb3_chac.plot import read_progress
+from sb3_chac.resume import find_training, steps
 from sb3_chac.resume import main as resume
-from sb3_chac.resume import steps
 
 SCRIPTS = Path(sysconfig.get_path("scripts"))
 RUNS = Path("logs") / "chac"
@@ -66,12 +71,12 @@ def kill_after_checkpoint(step: int, run_folder: Path, *command: str | Path, cwd
         process = subprocess.Popen(
             list(map(str, command)), cwd=cwd, env=clean_environment(), stdout=output, stderr=subprocess.STDOUT
         )
-        deadline = time.monotonic() + 300
-        while process.poll() is None and time.monotonic() < deadline:
+
+        def is_there() -> bool:
             newest = newest_checkpoint(cwd / run_folder / "checkpoints")
-            if newest is not None and int(newest.name) >= step:
-                break
-            time.sleep(0.01)
+            return newest is not None and int(newest.name) >= step
+
+        wait_until(lambda: is_there() or process.poll() is not None)
         process.kill()
         assert process.wait() == -signal.SIGKILL, (cwd / "output").read_text()
 
@@ -184,8 +189,26 @@ def test_what_cannot_be_resumed(killed, tmp_path, monkeypatch, capsys):
     shutil.copytree(killed / RUNS / "SafeDrive-v0_1" / "SafeDrive-v0", early / "SafeDrive-v0")
     output = refused(early)
     assert "holds no checkpoint yet" in output and f"rl_zoo3 train --algo chac --env SafeDrive-v0 -n {TOTAL} " in output
+    shutil.copytree(killed / RUNS / "SafeDrive-v0_3" / "checkpoints", early / "checkpoints")
+    for path in early.glob("checkpoints/*"):
+        (path / "replay_buffer.pkl").unlink()
+    output = refused(early)
+    assert "holds no checkpoint that is sound" in output and "replay_buffer.pkl is missing" in output
     (early / "SafeDrive-v0" / "argv.json").write_text("[")
     assert "cannot be read" in refused(early)
+
+
+def test_a_damaged_checkpoint_costs_what_is_said(killed, tmp_path, monkeypatch, capsys):
+    folder = tmp_path / RUNS / "SafeDrive-v0_3"
+    shutil.copytree(killed / RUNS / "SafeDrive-v0_3", folder)
+    monkeypatch.chdir(tmp_path)
+    newest, older = checkpoints(folder / "checkpoints")
+    (newest / "replay_buffer.pkl").write_bytes(b"damaged.")
+    (folder / "checkpoints" / "99999").mkdir()
+    command, model = find_training(RUNS / "SafeDrive-v0_3")
+    assert command == TRAIN and model == RUNS / "SafeDrive-v0_3" / "checkpoints" / older.name / "SafeDrive-v0.zip"
+    (line,) = capsys.readouterr().err.splitlines()
+    assert f"which costs {int(newest.name) - int(older.name)} steps" in line and "is damaged" in line
 
 
 def zoo_train(monkeypatch, *arguments: str) -> None:
@@ -267,7 +290,7 @@ def test_a_full_disk_does_not_stop_the_training(tmp_path, monkeypatch):
     assert attempts == [10, 20, 30, 40, 45] and len(messages) == 2
     assert "at step 20" in messages[0] and "No space left on device" in messages[0]
     assert f"{tmp_path / 'checkpoints' / '10'} is there to resume from" in messages[0]
-    assert [path.name for path in (tmp_path / "checkpoints").iterdir()] == ["45"]
+    assert {path.name for path in (tmp_path / "checkpoints").iterdir()} == {"45", "40"}
 
 
 def test_a_training_that_a_callback_stops_writes_no_half_step(tmp_path):

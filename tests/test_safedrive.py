@@ -58,9 +58,9 @@ def test_checkers_of_gymnasium_and_sb3():
 
 def test_known_without_import_and_by_import_alone(tmp_path):
     make = "import gymnasium; print(gymnasium.make('SafeDrive-v0').observation_space.shape)"
-    assert "(307,)" in run(sys.executable, "-c", make, cwd=tmp_path)
+    assert "(355,)" in run(sys.executable, "-c", make, cwd=tmp_path)
     off = {"SB3_CHAC_NO_AUTOLOAD": "1"}
-    assert "(307,)" in run(sys.executable, "-c", f"import sb3_chac.envs; {make}", cwd=tmp_path, env=off)
+    assert "(355,)" in run(sys.executable, "-c", f"import sb3_chac.envs; {make}", cwd=tmp_path, env=off)
     assert "NameNotFound" in run(sys.executable, "-c", make, cwd=tmp_path, env=off, fails=True)
 
 

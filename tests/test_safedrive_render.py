@@ -8,6 +8,7 @@ import textwrap
 import gymnasium as gym
 import numpy as np
 import pytest
+from shell import FOREVER
 
 from sb3_chac.envs import display
 from sb3_chac.envs.safedrive import SafeDriveEnv
@@ -205,7 +206,7 @@ def run(code, driver):
     if driver:
         variables["SDL_VIDEODRIVER"] = driver
     done = subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(code)], env=variables, capture_output=True, text=True, timeout=120
+        [sys.executable, "-c", textwrap.dedent(code)], env=variables, capture_output=True, text=True, timeout=FOREVER
     )
     assert done.returncode == 0, done.stderr
     return done.stdout.splitlines()[-1]

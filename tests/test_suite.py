@@ -5,11 +5,11 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
 import pytest
+from shell import FOREVER, wait_until
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 sys.path.insert(0, str(BENCHMARKS))
@@ -19,7 +19,7 @@ import suite_job  # noqa: E402
 import suite_report  # noqa: E402
 from suite_job import Job, Outcome  # noqa: E402
 
-from sb3_chac.common.checkpoints import newest_checkpoint  # noqa: E402
+from sb3_chac.common.checkpoints import newest_checkpoint, sound_checkpoint  # noqa: E402
 
 ROWS = {row.name: row for row in suite.ROWS}
 
@@ -151,14 +151,15 @@ def test_a_killed_suite_goes_on_from_checkpoints_and_takes_its_processes_along(t
     arguments = command(tmp_path, "run", "--rows", "pvp", "--seeds", "1", "--scale", "0.02", "--jobs", "1")
     first = subprocess.Popen(arguments, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     logs = tmp_path / "work" / "pvp-0" / "logs" / "pvp"
-    deadline = time.monotonic() + 120
-    while not any(newest_checkpoint(folder) for folder in logs.glob("*/checkpoints")):  # a complete one
-        assert first.poll() is None
-        assert time.monotonic() < deadline
-        time.sleep(0.2)
+
+    def has_checkpoint():
+        return any(newest_checkpoint(folder) for folder in logs.glob("*/checkpoints"))
+
+    wait_until(lambda: has_checkpoint() or first.poll() is not None, pause=0.2)
+    assert first.poll() is None
     first.send_signal(signal.SIGKILL)
     first.wait()
-    again = subprocess.run(arguments, capture_output=True, text=True, timeout=240)
+    again = subprocess.run(arguments, capture_output=True, text=True, timeout=FOREVER)
     assert again.returncode == 0, again.stdout + again.stderr
     assert "another process" not in again.stdout
     assert len(list(logs.glob("SafeDrive-v0_*"))) == 2  # the second resumed the first
@@ -169,11 +170,29 @@ def test_a_killed_suite_goes_on_from_checkpoints_and_takes_its_processes_along(t
     assert subprocess.run(arguments, capture_output=True, text=True).stdout.startswith("1 jobs: 1 done, 0 to do")
 
 
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_ends_the_suite_and_its_jobs_in_good_order(tmp_path, number):
+    arguments = command(tmp_path, "run", "--rows", "pvp", "bc", "--seeds", "1", "--scale", "0.02", "--jobs", "1")
+    process = subprocess.Popen(arguments, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+    folder = tmp_path / "work" / "pvp-0"
+    begun = folder / "logs" / "pvp" / "SafeDrive-v0_1" / "progress.csv"
+    wait_until(lambda: begun.exists() or process.poll() is not None, pause=0.2)
+    process.send_signal(number)
+    _, complaints = process.communicate(timeout=FOREVER)
+    assert process.returncode == 128 + number
+    assert complaints.splitlines()[-1] == (
+        f"Stopped by {signal.Signals(number).name}; the same command goes on from the checkpoints."
+    )
+    assert "Traceback" not in complaints and "Stopped by SIGTERM at step" in (folder / "log.txt").read_text()
+    assert sound_checkpoint(begun.parent / "checkpoints")[0] is not None
+    assert not (tmp_path / "work" / "bc-0" / "demonstrations").exists()  # the next one was not begun
+
+
 def test_a_failed_job_does_not_stop_the_others(tmp_path):
     (tmp_path / "work").mkdir()
     (tmp_path / "work" / "bc-0").write_text("in the way")  # a file where its folder should be
     arguments = command(tmp_path, "run", "--rows", "human", "bc", "--seeds", "1", "--scale", "0.001", "--jobs", "1")
-    ran = subprocess.run(arguments, capture_output=True, text=True, timeout=240)
+    ran = subprocess.run(arguments, capture_output=True, text=True, timeout=FOREVER)
     assert ran.returncode == 1
     assert "human-0: done" in ran.stdout
     assert "1 of 2 jobs failed" in ran.stdout
@@ -189,13 +208,10 @@ def test_a_ray_cluster_of_two_nodes_survives_the_loss_of_a_worker(tmp_path):
         cluster.add_node(num_cpus=1)
         jobs = command(tmp_path, "run", "--rows", "human", "--seeds", "3", "--scale", "0.001", "--ray", cluster.address)
         running = subprocess.Popen(jobs, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
-        deadline = time.monotonic() + 120
-        while not (workers := ray_workers()):
-            assert running.poll() is None
-            assert time.monotonic() < deadline
-            time.sleep(0.1)
-        os.kill(workers[0], signal.SIGKILL)
-        output, _ = running.communicate(timeout=400)
+        wait_until(lambda: ray_workers() or running.poll() is not None, pause=0.1)
+        assert running.poll() is None
+        os.kill(ray_workers()[0], signal.SIGKILL)
+        output, _ = running.communicate(timeout=FOREVER)
         assert running.returncode == 0, output
         assert len(list((tmp_path / "results").glob("*/episodes.csv"))) == 3
     finally:

@@ -1,4 +1,3 @@
-import os
 from collections import defaultdict
 from typing import Any, ClassVar, TypeVar
 
@@ -8,10 +7,11 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 
 from sb3_chac.bc.policies import LOSSES, BCPolicy, CnnPolicy, MlpPolicy
+from sb3_chac.common.arguments import checked
 from sb3_chac.common.checks import check_range
 from sb3_chac.common.offline import Batch, OfflineAlgorithm
 from sb3_chac.common.utils import minimize
-from sb3_chac.human.demonstrations import Demonstrations
+from sb3_chac.human.demonstrations import Dataset
 
 SelfBC = TypeVar("SelfBC", bound="BC")
 
@@ -33,7 +33,7 @@ class BC(OfflineAlgorithm):
     :param policy: The policy model to use (MlpPolicy, CnnPolicy)
     :param env: The environment that the dataset was recorded in (if registered in Gym, can be str), with a bounded Box or a
         Discrete action space
-    :param dataset: id or folder of a dataset of Minari, or Demonstrations
+    :param dataset: see ``load_demonstrations``: id or folder of a dataset of Minari, a list of them, ...
     :param learning_rate: learning rate, it can be a function of the current progress remaining (from 1 to 0)
     :param batch_size: Minibatch size for each gradient update
     :param loss: "mse", which acts deterministically, or "nll", which also learns how much the actions vary;
@@ -57,11 +57,12 @@ class BC(OfflineAlgorithm):
     required_policy = BCPolicy
     policy: BCPolicy
 
+    @checked
     def __init__(
         self,
         policy: str | type[BCPolicy],
         env: GymEnv | str,
-        dataset: str | os.PathLike[str] | Demonstrations | None = None,
+        dataset: Dataset | None = None,
         learning_rate: float | Schedule = 3e-4,
         batch_size: int = 256,
         loss: str = "mse",

@@ -1,4 +1,4 @@
-from collections import defaultdict
+from collections import deque
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -9,14 +9,17 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.sac.policies import Actor
 
 from sb3_chac.chac.policies import CONTROLS, CHACPolicy, CnnPolicy, MlpPolicy, MultiInputPolicy
-from sb3_chac.common.buffers import DualReplayBuffer, DualReplayBufferSamples, take_rows
+from sb3_chac.common.arguments import checked
+from sb3_chac.common.buffers import DualReplayBuffer, DualReplayBufferSamples
 from sb3_chac.common.checks import check_integer, check_range
 from sb3_chac.common.critics import DistributionalCritic
-from sb3_chac.common.distributional import gaussian_surrogate_loss, return_targets
+from sb3_chac.common.distributional import return_targets
 from sb3_chac.common.utils import TargetUpdate, minimize
 from sb3_chac.dpvp.dpvp import DPVP
 
 SelfCHAC = TypeVar("SelfCHAC", bound="CHAC")
+
+MOST_CHOICES = 1000  # steps of which the logger is told who drove, at most
 
 
 class CHAC(DPVP):
@@ -46,6 +49,10 @@ class CHAC(DPVP):
     - In stage 2, Z_c bootstraps on what is executed, not on pi_r alone (``bootstrap``).
     - pi_r exploits what Z_c believes of actions that nobody has tried, and leaves the road in most episodes after the switch.
       It is tied to pi_g: it maximises Q_c - alpha log pi_r - anchor_coef ||a_r - a_g||^2 (``anchor_coef``).
+    - Z_c learns rewards in units of their root mean square (``normalize_rewards``), so that stage 2 does the same whatever the
+      scale of a task's reward.
+    - The return hardly shows a collision (5 of 370 on SafeDrive): the safety cost is subtracted from the reward that Z_c
+      learns (``cost_coef``).
 
     ``preset`` fills in the arguments that are None, those of ``DPVP`` and:
 
@@ -58,6 +65,8 @@ class CHAC(DPVP):
     bootstrap           "executed"  "self"
     stage2_human_share  0.25        0
     anchor_coef         20          0
+    normalize_rewards   True        False
+    cost_coef           60          0
     ==================  ==========  =======
 
     The parameters are those of ``DPVP``, and:
@@ -76,7 +85,9 @@ class CHAC(DPVP):
     :param bootstrap: "executed": Z_c evaluates what is executed in stage 2 (shared control); "self": pi_r
     :param stage2_human_share: share of the human's transitions in the batches of stage 2
     :param anchor_coef: weight of the squared distance between the actions of pi_r and pi_g, both in [-1, 1], in pi_r's loss;
-        in units of the return
+        in units of what Z_c learns
+    :param normalize_rewards: whether Z_c learns rewards in units of their running root mean square
+    :param cost_coef: what ``info["cost"]`` counts against (normalised) rewards in Z_c
     :raises ValueError: for an argument out of its range, an action space that is not a bounded Box, or, while learning,
         an observation or reward that is NaN or infinite
     """
@@ -92,11 +103,10 @@ class CHAC(DPVP):
             "anchor_coef": 20.0,
             "normalize_rewards": True,
             "cost_coef": 60.0,
-            "takeover_cost": 0.0,
         },
         "paper": DPVP.presets["paper"]
         | {"sigma_scale": 1.0, "prefit_steps": 0, "bootstrap": "self", "stage2_human_share": 0.0, "anchor_coef": 0.0}
-        | {"normalize_rewards": False, "cost_coef": 0.0, "takeover_cost": 0.0},
+        | {"normalize_rewards": False, "cost_coef": 0.0},
     }
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
         "MlpPolicy": MlpPolicy,
@@ -110,6 +120,7 @@ class CHAC(DPVP):
     self_actor: Actor
     self_actor_target: Actor
 
+    @checked
     def __init__(
         self,
         policy: str | type[CHACPolicy],
@@ -157,7 +168,6 @@ class CHAC(DPVP):
         anchor_coef: float | None = None,
         normalize_rewards: bool | None = None,
         cost_coef: float | None = None,
-        takeover_cost: float | None = None,
         use_sde: bool = False,
         sde_sample_freq: int = -1,
         use_sde_at_warmup: bool = False,
@@ -227,7 +237,6 @@ class CHAC(DPVP):
         self.anchor_coef: Any = anchor_coef
         self.normalize_rewards: Any = normalize_rewards
         self.cost_coef: Any = cost_coef
-        self.takeover_cost: Any = takeover_cost
 
         if _init_setup_model:
             self._setup_model()
@@ -241,7 +250,8 @@ class CHAC(DPVP):
         self.confidence_update = TargetUpdate(self.confidence_critic, self.confidence_critic_target)
         self.self_update = TargetUpdate(self.self_actor, self.self_actor_target)
         self.self_average_update = TargetUpdate(self.self_actor, self.policy.averaged_self_actor)
-        self.choices: defaultdict[str, list[np.ndarray]] = defaultdict(list)
+        # Since the logger took them, or the latest: nobody may ever take them
+        self.choices: deque[dict[str, np.ndarray]] = deque(maxlen=MOST_CHOICES)
 
     def _create_aliases(self) -> None:
         super()._create_aliases()
@@ -266,7 +276,6 @@ class CHAC(DPVP):
         check_range("stage2_human_share", self.stage2_human_share, low=0.0, high=1.0)
         check_range("anchor_coef", self.anchor_coef, low=0.0)
         check_range("cost_coef", self.cost_coef, low=0.0)
-        check_range("takeover_cost", self.takeover_cost, low=0.0)
         if self.bootstrap not in ("executed", "self"):
             raise ValueError(f"bootstrap must be 'executed' or 'self', got {self.bootstrap!r}.")
 
@@ -283,8 +292,7 @@ class CHAC(DPVP):
         self._show_stage()
 
     def _show_stage(self) -> None:
-        if self.env is not None and self.env.has_attr("set_stage"):
-            self.env.env_method("set_stage", self.stage)
+        self._ask_wrappers(self._wrapped, "set_stage", self.stage)
 
     def _optimizers(self) -> list[th.optim.Optimizer]:
         return [*super()._optimizers(), self.confidence_critic.optimizer, self.self_actor.optimizer]
@@ -324,17 +332,7 @@ class CHAC(DPVP):
         else:
             targets = self._shared_return_targets(batch, rewards, ent_coef)
         losses, _, stats = self._critic_losses(self.confidence_critic, batch, targets, self.eta_c)
-        loss = losses.mean(dim=1).sum()
-        human = batch.takeovers.flatten().nonzero().flatten()
-        if self.takeover_cost > 0 and len(human) > 0:
-            penalty = self.cost_coef * self.takeover_cost
-            q_novice, std_novice = self.confidence_critic(take_rows(batch.observations, human), batch.novice_actions[human])
-            differ = (batch.actions - batch.novice_actions)[human].square().mean(dim=1).sqrt() >= self.pv_min_diff
-            shifted = (t[human] - penalty for t in targets)
-            eta = self.eta if self.eta_c is None else self.eta_c
-            labels = gaussian_surrogate_loss(q_novice, std_novice, *shifted, self.confidence_critic.mean_std, eta)
-            loss = loss + (labels * differ).sum() / len(batch.takeovers)
-        minimize(loss, self.confidence_critic.optimizer)
+        minimize(losses.mean(dim=1).sum(), self.confidence_critic.optimizer)
         self.confidence_update(self.tau if self.tau_c is None else self.tau_c)
         return {f"confidence_{name}": value for name, value in stats.items()}
 
@@ -411,9 +409,8 @@ class CHAC(DPVP):
         self.policy.last_choice = None
         sampled = super()._sample_action(learning_starts, action_noise, n_envs)
         if self.policy.last_choice is not None:
-            for name, values in self.policy.last_choice._asdict().items():
-                if name != "actions":
-                    self.choices[name].append(values.cpu().numpy())
+            choice = self.policy.last_choice._asdict()
+            self.choices.append({name: values.cpu().numpy() for name, values in choice.items() if name != "actions"})
         return sampled
 
     def predict(
@@ -442,7 +439,7 @@ class CHAC(DPVP):
     def dump_logs(self) -> None:
         self.logger.record("chac/stage", self.stage)
         if self.choices:
-            means = {name: np.concatenate(values) for name, values in self.choices.items()}
+            means = {name: np.concatenate([choice[name] for choice in self.choices]) for name in self.choices[0]}
             self.choices.clear()
             confidence = means.pop("confidence")
             self.logger.record("chac/self_share", means.pop("self_drives").mean())

@@ -7,6 +7,7 @@ from stable_baselines3.sac.policies import Actor
 
 from sb3_chac.common.critics import DistributionalCritic
 from sb3_chac.common.distributional import probability_of_improvement
+from sb3_chac.common.linear import is_traced
 from sb3_chac.dpvp.policies import DPVPPolicy
 
 CONTROLS = ("guided", "self", "shared")
@@ -92,19 +93,29 @@ class CHACPolicy(DPVPPolicy):
         scaled = self.sigma_scale * std_self, self.sigma_scale * std_guided
         confidence = probability_of_improvement(q_self, scaled[0], q_guided, scaled[1])
         # For delta 1 also where the confidence is too small for a float
-        self_drives = (confidence > 1 - self.delta) | (self.delta == 1)
+        self_drives = confidence > 1 - self.delta if self.delta < 1 else th.ones_like(confidence, dtype=th.bool)
         actions = th.where(self_drives.unsqueeze(1), self_actions, guided_actions)
         return Choice(actions, self_drives, confidence, q_self, q_guided, std_self, std_guided)
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
-        control = "guided" if self.stage == 1 else self.control
-        if control == "guided":
+        if is_traced() and self.control != "guided":  # a branch on a tensor would be lost
+            guided_actions = super()._predict(observation, deterministic)
+            actions, _ = self._predict_in_stage_2(observation, deterministic)
+            return th.where(self.stage == 1, guided_actions, actions)
+        if self.control == "guided" or self.stage == 1:
             return super()._predict(observation, deterministic)
+        actions, self.last_choice = self._predict_in_stage_2(observation, deterministic)
+        return actions
+
+    def _predict_in_stage_2(self, observation: PyTorchObs, deterministic: bool) -> tuple[th.Tensor, Choice | None]:
+        """
+        :return: the actions of pi_r, or of shared control with what it decided
+        """
         self_actions = self.averaged_self_actor(observation, True) if deterministic else self.self_actor(observation)
-        if control == "self":
-            return self_actions
-        self.last_choice = self.choose(observation, self_actions, self.confidence_critic)
-        return self.last_choice.actions
+        if self.control == "self":
+            return self_actions, None
+        choice = self.choose(observation, self_actions, self.confidence_critic)
+        return choice.actions, choice
 
     def reset_noise(self, batch_size: int = 1) -> None:
         super().reset_noise(batch_size)

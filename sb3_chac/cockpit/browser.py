@@ -25,9 +25,9 @@ class Address(NamedTuple):
     def is_loopback(self) -> bool:
         return self.host == "localhost" or (is_number(self.host) and ipaddress.ip_address(self.host).is_loopback)
 
-    def url(self, token: str) -> str:
+    def url(self, token: str, scheme: str = "http") -> str:
         host = f"[{self.host}]" if ":" in self.host else self.host
-        return f"http://{host}:{self.port}/?token={token}"
+        return f"{scheme}://{host}:{self.port}/?token={token}"
 
 
 def parse_address(text: str) -> Address:
@@ -37,7 +37,7 @@ def parse_address(text: str) -> Address:
     """
     host, _, port = text.rpartition(":")
     host = host.removeprefix("[").removesuffix("]") or "127.0.0.1"
-    if not port.isascii() or not port.isdecimal() or int(port) > 65535:
+    if not port.isascii() or not port.isdecimal() or len(port) > 5 or int(port) > 65535:
         raise ValueError(f"--serve must be PORT or HOST:PORT, for example 127.0.0.1:8000, got {text!r}.")
     return Address(host, int(port))
 
@@ -99,7 +99,7 @@ def _gamepad(values: Any) -> tuple[float, float, float] | None:
     if not isinstance(values, list) or len(values) != 3:
         raise BadMessage("a gamepad has three values")
     for value in values:
-        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value) or abs(value) > 1:
+        if isinstance(value, bool) or not isinstance(value, int | float) or not -1 <= value <= 1:
             raise BadMessage("values of a gamepad are from -1 to 1")
     return float(values[0]), float(values[1]), float(values[2])
 

@@ -7,6 +7,7 @@ import numpy as np
 
 from sb3_chac.cockpit.recording import Recorder
 from sb3_chac.cockpit.session import Drive, lost_message
+from sb3_chac.common.contract import TakeoverDisplay
 from sb3_chac.human.intervention import ControlState, InterventionWrapper
 
 STANDS = 0.3  # [m/s]
@@ -57,19 +58,20 @@ class Cockpit(gym.Wrapper):
             if self.env.state is ControlState.TAKEOVER:
                 return self._brake_to_a_stand()
             drive.pause(lost_message(person.device.name))
+        proposed = np.array(action)  # the environment may change what it is given
         observation, reward, terminated, truncated, info = self.env.step(action)
         truncated = truncated or (drive.take_skip() and not terminated)
         self.steps += 1
-        self.recorder.add(action, observation, float(reward), terminated, truncated, info)
+        self.recorder.add(proposed, observation, float(reward), terminated, truncated, info)
         self._show(
             info,
             takeover=info["takeover"],
-            proposed=person.as_input(action),
+            proposed=person.as_input(proposed),
             applied=person.as_input(info["applied_action"]),
             total_steps=drive.display.total_steps + 1,
             human_steps=drive.display.human_steps + bool(info["takeover"]),
             seconds=drive.display.seconds + drive.period,
-            cost=drive.display.cost + info["cost"],
+            cost=drive.display.cost + info.get("cost", 0.0),
             novice=drive.novice,
         )
         return observation, reward, terminated, truncated, info
@@ -96,7 +98,7 @@ class Cockpit(gym.Wrapper):
         return observation, 0.0, False, True, {**info, "unattended": True}
 
     def _show(self, info: dict[str, Any], takeover: bool, **changes: Any) -> None:
-        if hasattr(self.unwrapped, "hud"):
+        if isinstance(self.unwrapped, TakeoverDisplay):
             self.unwrapped.hud = {"takeover": takeover}  # the rest is told beside the picture
         picture = self.env.env.render()
         if isinstance(picture, list):

@@ -13,7 +13,7 @@ from gymnasium.envs.registration import EnvSpec
 
 from sb3_chac.common.checkpoints import sync
 from sb3_chac.human.dataset_writer import DatasetWriter, folder_to_make, storable_spec
-from sb3_chac.human.demonstrations import check_spaces
+from sb3_chac.human.demonstrations import DatasetError, check_spaces
 from sb3_chac.human.recording import Recorder as EpisodeRecorder
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ class Summary:
     :param takeover_rate: human_steps / steps
     :param takeovers: number of segments that the person drove
     :param mean_takeover_steps: length of a segment
-    :param cost: sum of the safety costs
+    :param cost: sum of the safety costs, None if they were not measured
     :param human_cost: that arose while the person drove
     :param successes: episodes that reached their goal, None if the environment does not tell
     :param seconds: [s] of driving, without pauses
@@ -49,7 +49,7 @@ class Summary:
     takeover_rate: float
     takeovers: int
     mean_takeover_steps: float
-    cost: float
+    cost: float | None
     human_cost: float
     successes: int | None
     seconds: float
@@ -59,8 +59,9 @@ class Summary:
             f"Driven: {self.episodes} episodes, {self.steps} steps, {self.seconds / 60:.1f} minutes",
             f"  by you        {self.human_steps} steps ({self.takeover_rate:.1%}) in {self.takeovers} takeovers of "
             f"{self.mean_takeover_steps:.1f} steps",
-            f"  safety cost   {self.cost:g}, {self.human_cost:g} of it while you drove",
         ]
+        if self.cost is not None:
+            lines.append(f"  safety cost   {self.cost:g}, {self.human_cost:g} of it while you drove")
         if self.successes is not None:
             lines.append(f"  arrived       {self.successes} of {self.episodes}")
         if self.dataset is not None:
@@ -84,6 +85,8 @@ class Recorder:
     def __init__(self, folder: Path, env: gym.Env, dataset: str, policy: str, seconds_per_step: float) -> None:
         check_spaces(env.observation_space, env.action_space)
         folder_to_make(dataset, overwrite=False)
+        from minari.serialization import serialize_space
+
         self.run_folder, self.env = folder, env
         self.folder = folder / FOLDER
         self.folder.mkdir(parents=True, exist_ok=True)
@@ -95,6 +98,7 @@ class Recorder:
             "policy": policy,
             "seconds_per_step": seconds_per_step,
             "spec": spec.to_json() if spec else None,
+            "spaces": [serialize_space(space) for space in (env.observation_space, env.action_space)],
         }
         write_safely(self.folder / ABOUT, json.dumps(about).encode())
         self.number = 0
@@ -117,6 +121,7 @@ class Recorder:
         :param action: what the novice proposed
         :param observation: what followed
         """
+        stored = EpisodeRecorder.stored_infos(action, info, self.env.action_space)
         self._steps.append(
             {
                 "observation": np.array(observation),
@@ -124,7 +129,7 @@ class Recorder:
                 "reward": reward,
                 "termination": terminated,
                 "truncation": truncated,
-                **{f"info/{name}": value for name, value in EpisodeRecorder.stored_infos(action, info).items()},
+                **{f"info/{name}": value for name, value in stored.items()},
             }
         )
         if terminated or truncated:
@@ -162,11 +167,25 @@ def finish_recording(run_folder: Path) -> Summary | None:
     if not (run_folder / FOLDER / ABOUT).is_file():
         return None
     about = json.loads((run_folder / FOLDER / ABOUT).read_text())
-    env = gym.make(EnvSpec.from_json(about["spec"]))
-    try:
-        return _finish(run_folder, env)
-    finally:
-        env.close()
+    return _finish(run_folder, RecordedEnv(about))
+
+
+class RecordedEnv(gym.Env):
+    """
+    What is known of an environment that was recorded, to be written down. It is never made: a file runs no code.
+
+    :param about: what ``Recorder`` has written
+    :raises DatasetError: if that is damaged
+    """
+
+    def __init__(self, about: dict[str, Any]) -> None:
+        from minari.serialization import deserialize_space
+
+        try:
+            self.observation_space, self.action_space = map(deserialize_space, about["spaces"])
+            self.spec = EnvSpec.from_json(about["spec"]) if about["spec"] else None
+        except Exception as error:  # nearly anything, of a damaged file
+            raise DatasetError(f"{ABOUT} of the drive cannot be read: {type(error).__name__}: {error}") from error
 
 
 def _finish(run_folder: Path, env: gym.Env) -> Summary:
@@ -210,7 +229,8 @@ def _summary(episodes: list[dict[str, np.ndarray]], dataset: Path | None, second
     takeovers = [episode["info/takeover"] for episode in episodes]
     starts = sum(int(np.count_nonzero(np.diff(flags.astype(int), prepend=0) == 1)) for flags in takeovers)
     steps, human_steps = sum(map(len, takeovers)), int(sum(flags.sum() for flags in takeovers))
-    costs = [episode["info/cost"] for episode in episodes]
+    is_measured = bool(episodes) and all("info/cost" in episode for episode in episodes)
+    costs = [episode["info/cost"] for episode in episodes] if is_measured else []
     tell_success = bool(episodes) and all("info/is_success" in episode for episode in episodes)
     return Summary(
         dataset=str(dataset) if dataset else None,
@@ -220,8 +240,8 @@ def _summary(episodes: list[dict[str, np.ndarray]], dataset: Path | None, second
         takeover_rate=human_steps / steps if steps else 0.0,
         takeovers=starts,
         mean_takeover_steps=human_steps / starts if starts else 0.0,
-        cost=float(sum(values.sum() for values in costs)),
-        human_cost=float(sum((values * flags).sum() for values, flags in zip(costs, takeovers, strict=True))),
+        cost=float(sum(values.sum() for values in costs)) if is_measured else None,
+        human_cost=float(sum((values * flags).sum() for values, flags in zip(costs, takeovers, strict=False))),
         successes=sum(bool(episode["info/is_success"][-1]) for episode in episodes) if tell_success else None,
         seconds=steps * seconds_per_step,
     )

@@ -62,6 +62,8 @@ class DriveManager(ExperimentManager):
     :param wrap: puts the person and the cockpit around the environment
     """
 
+    tells_errors = True
+
     def __init__(self, wrap: Callable[[gym.Env], gym.Env], args: argparse.Namespace) -> None:
         super().__init__(
             args,
@@ -134,6 +136,8 @@ class DriveRun:
             self.run_folder = Path(self.manager.save_path)
             with contextlib.redirect_stdout(io.StringIO()) if args.verbose == 0 else contextlib.nullcontext():
                 model, _ = self.manager.setup_experiment()  # type: ignore[misc]
+        except (TypeError, AttributeError, KeyError) as error:  # of hyperparameters and environments that do not fit
+            raise NotDrivable(f"{args.algo} on {args.env} cannot be set up: {type(error).__name__}: {error}") from error
         finally:
             ALGOS[args.algo] = algorithm
         self._learn(model)  # type: ignore[arg-type]

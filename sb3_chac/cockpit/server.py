@@ -6,16 +6,18 @@ Who may connect: only who has the access token of this drive, from a page that t
 import asyncio
 import hmac
 import io
+import logging
+import re
 import secrets
 import signal
 import socket
+import ssl
 import sys
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager, suppress
 from pathlib import Path
 from typing import Any
-from urllib.parse import urlsplit
 
 import numpy as np
 from PIL import Image
@@ -26,15 +28,22 @@ except ImportError as error:
     raise RuntimeError('--serve needs aiohttp: pip install "sb3-chac[cockpit]".') from error
 
 from sb3_chac.cockpit.browser import Address, BadMessage, Browser, Held, Wish, is_number, parse
+from sb3_chac.cockpit.devices import Clock
 from sb3_chac.cockpit.session import Drive, indicators
+
+logger = logging.getLogger(__name__)
 
 STATIC = Path(__file__).parent / "static"
 FILES = {"/": "index.html", "/cockpit.js": "cockpit.js", "/cockpit.css": "cockpit.css"}
 MOST_BYTES = 1024  # of a message
-MOST_MESSAGES = 200  # of a viewer in a second
+MOST_MESSAGES = 200  # of a viewer in a second, control frames included
+MOST_REQUESTS = 100  # of an address in a second
+MOST_REMARKS = 10  # in the log in a second
 MOST_VIEWERS = 16
 MOST_CONNECTIONS = 64
 PATIENCE = 10.0  # [s] with a connection that asks for nothing
+HEARTBEAT = 5.0  # [s] between two questions whether a viewer is still there
+HOST = re.compile(r"(\[[0-9a-fA-F:.]+\]|[0-9a-zA-Z._-]+)(:[0-9]{1,5})?")
 LOOK, TELL = 0.01, 0.05  # [s] between two looks for a new picture, and between two messages to a viewer at most
 HEADERS = {
     "X-Content-Type-Options": "nosniff",
@@ -43,7 +52,7 @@ HEADERS = {
     "X-Frame-Options": "DENY",
 }
 POLICY = (
-    "default-src 'none'; script-src 'self'; style-src 'self'; img-src blob:; connect-src 'self' ws://{host}; "
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src blob:; connect-src 'self' {socket}://{host}; "
     "frame-ancestors 'none'; base-uri 'none'; form-action 'none'"
 )
 
@@ -53,21 +62,34 @@ class Viewer:
     One page that is open.
 
     :param may_drive: whether it may take the wheel
+    :param remote: its address
     """
 
-    def __init__(self, socket: web.WebSocketResponse, may_drive: bool) -> None:
-        self.socket, self.may_drive = socket, may_drive
+    def __init__(self, socket: web.WebSocketResponse, may_drive: bool, remote: str | None) -> None:
+        self.socket, self.may_drive, self.remote = socket, may_drive, remote
         self.news = asyncio.Event()
         self.shown = -1  # number of the newest picture it was sent
-        self._second, self._messages = 0.0, 0
 
-    def is_flooding(self) -> bool:
-        """To be called once per message."""
-        now = time.monotonic()
+
+class Counter:
+    """
+    How much one viewer, or one address, asks for: too much if it is more than ``most`` within a second.
+
+    :param most: number of requests or messages
+    :param clock: [s]
+    """
+
+    def __init__(self, most: int, clock: Clock) -> None:
+        self.most, self.clock = most, clock
+        self._second, self._count = 0.0, 0
+
+    def is_flooded(self) -> bool:
+        """To be called once for each."""
+        now = self.clock()
         if now - self._second > 1:
-            self._second, self._messages = now, 0
-        self._messages += 1
-        return self._messages > MOST_MESSAGES
+            self._second, self._count = now, 0
+        self._count += 1
+        return self._count > self.most
 
 
 class Server:
@@ -77,16 +99,28 @@ class Server:
     There are two access tokens, one for who may drive and one for who may watch. Nobody gets anything without one, on loopback
     neither, for others may use the machine. Requests under other host names (DNS rebinding) and WebSockets of other origins
     are refused, as are messages that the page does not send. One viewer sits at the wheel; it becomes free when that one
-    leaves, and is taken by a click then, not by itself.
+    leaves, and is taken by a click then, not by itself. Limits hold for those without a token, too. Who is refused or dropped
+    is told to the log, without tokens.
 
     :param drive: with ``device`` at its wheel
     :param device: of the driver
     :param address: port 0 for any that is free
+    :param tls: certificate and key, None to encrypt nothing
+    :param clock: [s], by which requests and messages are counted
     """
 
-    def __init__(self, drive: Drive, device: Browser, address: Address) -> None:
-        self.drive, self.device, self.address = drive, device, address
+    def __init__(
+        self,
+        drive: Drive,
+        device: Browser,
+        address: Address,
+        tls: ssl.SSLContext | None = None,
+        clock: Clock = time.monotonic,
+    ) -> None:
+        self.drive, self.device, self.address, self.tls, self.clock = drive, device, address, tls, clock
         self.driver_token, self.spectator_token = secrets.token_urlsafe(24), secrets.token_urlsafe(24)
+        self._remarks = Counter(MOST_REMARKS, clock)
+        self._requests: dict[str | None, Counter] = {}  # by address
         self.viewers: list[Viewer] = []
         self.driver: Viewer | None = None
         self._picture: tuple[int, bytes] = (-1, b"")
@@ -112,7 +146,9 @@ class Server:
 
         loop = asyncio.get_running_loop()
         try:
-            listener = await loop.create_server(connect, self.address.host, self.address.port, backlog=MOST_CONNECTIONS)
+            listener = await loop.create_server(
+                connect, self.address.host, self.address.port, backlog=MOST_CONNECTIONS, ssl=self.tls
+            )
         except OSError as error:
             await runner.cleanup()
             reason = error.strerror or str(error)
@@ -137,18 +173,50 @@ class Server:
         self, request: web.Request, handler: Callable[[web.Request], Awaitable[web.StreamResponse]]
     ) -> web.StreamResponse:
         self._useful.add(request.protocol)
-        host = urlsplit(f"//{request.host}").hostname or ""
-        own = {"localhost", self.address.host, socket.gethostname().lower()}
-        if not (host in own or is_number(host)):
-            raise web.HTTPForbidden(text="This host name is not served. Use the address that was printed.")
         try:
+            self._check_request(request)
             response = await handler(request)
         except web.HTTPException as refusal:
             refusal.headers.update(HEADERS)
+            self._remark(f"refused {request.path!r:.40} to {request.remote}: {refusal.status} {refusal.text}")
             raise
         if not response.prepared:
-            response.headers.update({**HEADERS, "Content-Security-Policy": POLICY.format(host=request.host)})
+            policy = POLICY.format(host=request.host, socket="wss" if self.tls else "ws")
+            response.headers.update({**HEADERS, "Content-Security-Policy": policy})
         return response
+
+    def _check_request(self, request: web.Request) -> None:
+        """
+        What holds for everybody, whether there is a token or not.
+
+        :raises HTTPException: for too many requests of an address, and for another host name
+        """
+        if len(self._requests) > MOST_CONNECTIONS:
+            self._requests.clear()
+        if self._requests.setdefault(request.remote, Counter(MOST_REQUESTS, self.clock)).is_flooded():
+            raise web.HTTPTooManyRequests(text="Too many requests: wait a second.")
+        found = HOST.fullmatch(request.host)
+        host = found[1].strip("[]").lower() if found else ""
+        own = {"localhost", self.address.host.lower(), socket.gethostname().lower()}
+        if not (host in own or is_number(host)):
+            raise web.HTTPForbidden(text="This host name is not served. Use the address that was printed.")
+
+    def _remark(self, text: str) -> None:
+        """
+        :param text: for the log, without a token
+        """
+        if not self._remarks.is_flooded():
+            logger.warning("cockpit: %s", text)
+
+    @property
+    def scheme(self) -> str:
+        return "https" if self.tls else "http"
+
+    def url(self, token: str) -> str:
+        """
+        :param token: one of the two
+        """
+        return self.address.url(token, self.scheme)
 
     def _may_drive(self, request: web.Request) -> bool:
         """
@@ -162,18 +230,25 @@ class Server:
         raise web.HTTPForbidden(text="The access token is missing or wrong. Use the address that was printed.")
 
     async def _file(self, request: web.Request) -> web.StreamResponse:
-        if request.path == "/":
-            self._may_drive(request)
-        return web.FileResponse(STATIC / FILES[request.path])
+        self._may_drive(request)
+        if request.path != "/":
+            return web.FileResponse(STATIC / FILES[request.path])
+        page = (STATIC / FILES["/"]).read_text()
+        for name in ("cockpit.css", "cockpit.js"):  # they are not served without the token either
+            page = page.replace(f'"{name}"', f'"{name}?token={request.query["token"]}"')
+        return web.Response(text=page, content_type="text/html")
 
     async def _websocket(self, request: web.Request) -> web.StreamResponse:
-        if request.headers.get("Origin") != f"http://{request.host}":
+        if request.headers.get("Origin") != f"{self.scheme}://{request.host}":
             raise web.HTTPForbidden(text="Only the cockpit's own page may connect.")
         may_drive = self._may_drive(request)
         if len(self.viewers) >= MOST_VIEWERS:
             raise web.HTTPServiceUnavailable(text=f"There are {MOST_VIEWERS} viewers already.")
-        channel = web.WebSocketResponse(max_msg_size=MOST_BYTES, heartbeat=5.0, compress=False, timeout=1.0)
-        viewer = Viewer(channel, may_drive)
+        # Without autoping, control frames come as messages and are counted
+        channel = web.WebSocketResponse(
+            max_msg_size=MOST_BYTES, heartbeat=HEARTBEAT, compress=False, timeout=1.0, autoping=False
+        )
+        viewer = Viewer(channel, may_drive, request.remote)
         self.viewers.append(viewer)
         telling = None
         try:
@@ -185,6 +260,8 @@ class Server:
             if telling is not None:
                 telling.cancel()
             self.viewers.remove(viewer)
+            if channel.close_code == WSCloseCode.ABNORMAL_CLOSURE:
+                self._remark(f"lost the viewer at {viewer.remote}")
             if self.driver is viewer:
                 self.driver = None
                 with self.drive.person.lock:
@@ -201,14 +278,21 @@ class Server:
     # What they say
 
     async def _listen(self, viewer: Viewer) -> None:
+        counter = Counter(MOST_MESSAGES, self.clock)
         async for message in viewer.socket:
             try:
-                if viewer.is_flooding():
+                if counter.is_flooded():
                     raise BadMessage("too many messages")
+                if message.type is WSMsgType.PING:
+                    await viewer.socket.pong(message.data)
+                    continue
+                if message.type is WSMsgType.PONG:
+                    continue
                 if message.type is not WSMsgType.TEXT:
                     raise BadMessage("not text")
                 await self._obey(viewer, parse(message.data))
             except BadMessage as error:
+                self._remark(f"dropped the viewer at {viewer.remote}: {error}")
                 await viewer.socket.close(code=WSCloseCode.POLICY_VIOLATION, message=str(error).encode())
                 return
 
@@ -304,8 +388,27 @@ def as_jpeg(picture: np.ndarray) -> bytes:
     return file.getvalue()
 
 
+def tls_context(certificate: Path, key: Path | None) -> ssl.SSLContext:
+    """
+    :param certificate: PEM
+    :param key: PEM, None if it is in the same file
+    :raises ValueError: if they cannot be used
+    """
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    try:
+        context.load_cert_chain(certificate, key, password=lambda: b"")
+    except (OSError, ValueError) as error:  # of SSL, too
+        raise ValueError(f"--tls-cert {certificate}, --tls-key {key}: cannot be used ({error}).") from error
+    return context
+
+
 async def serve(
-    drive: Drive, device: Browser, address: Address, begin: Callable[[], None], is_over: Callable[[], bool]
+    drive: Drive,
+    device: Browser,
+    address: Address,
+    begin: Callable[[], None],
+    is_over: Callable[[], bool],
+    tls: ssl.SSLContext | None = None,
 ) -> None:
     """
     Serves the cockpit until the drive is over. SIGINT and SIGTERM end it as the person's quit does.
@@ -315,22 +418,23 @@ async def serve(
     :param address: where
     :param begin: called as soon as it is served
     :param is_over: asked from then on
+    :param tls: certificate and key, None to encrypt nothing
     :raises OSError: if the address cannot be had
     """
-    server = Server(drive, device, address)
+    server = Server(drive, device, address, tls)
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, drive.quit)
     async with server.listening():
-        if not server.address.is_loopback:
+        if not server.address.is_loopback and tls is None:
             print(
-                f"Warning: {address.host} can be reached from other machines, and nothing is encrypted. Safer: --serve "
-                f"127.0.0.1:{server.address.port}, and on your machine ssh -L {server.address.port}:127.0.0.1:"
+                f"Warning: {address.host} can be reached from other machines, and nothing is encrypted. Safer: --tls-cert, or "
+                f"--serve 127.0.0.1:{server.address.port}, and on your machine ssh -L {server.address.port}:127.0.0.1:"
                 f"{server.address.port} HERE.",
                 file=sys.stderr,
             )
-        print(f"Drive at  {server.address.url(server.driver_token)}")
-        print(f"Watch at  {server.address.url(server.spectator_token)}", flush=True)
+        print(f"Drive at  {server.url(server.driver_token)}")
+        print(f"Watch at  {server.url(server.spectator_token)}", flush=True)
         begin()
         while not is_over():
             await asyncio.sleep(0.1)

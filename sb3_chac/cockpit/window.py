@@ -1,5 +1,6 @@
 """The cockpit's window: the picture, the paper's indicators, the actions, and the keys."""
 
+import os
 import time
 from collections.abc import Callable
 from typing import Any
@@ -55,9 +56,14 @@ class Window:
     def __init__(self, title: str) -> None:
         try:
             pygame.display.init()
+            # SDL falls back to drivers that show nothing
+            if pygame.display.get_driver() in ("dummy", "offscreen") and "SDL_VIDEODRIVER" not in os.environ:
+                raise pygame.error("there is no display")
             self.screen = pygame.display.set_mode(SIZE)
         except pygame.error as error:
-            raise RuntimeError(f"The cockpit's window could not be opened: {error}. It needs a display.") from error
+            raise RuntimeError(
+                f"The cockpit's window could not be opened: {error}. Drive in a browser instead: --serve 8000."
+            ) from error
         pygame.display.set_caption(title)
         pygame.font.init()
         pygame.event.set_blocked(pygame.MOUSEMOTION)

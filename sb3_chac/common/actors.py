@@ -15,6 +15,11 @@ class FastSquashedGaussian(SquashedDiagGaussianDistribution):
     and ``torch.distributions`` with its checks is left out.
     """
 
+    def actions_from_params(self, mean_actions: th.Tensor, log_std: th.Tensor, deterministic: bool = False) -> th.Tensor:
+        if deterministic:
+            return th.tanh(mean_actions)
+        return th.tanh(mean_actions + log_std.exp() * th.randn_like(mean_actions))
+
     def log_prob_from_params(self, mean_actions: th.Tensor, log_std: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         noise = th.randn_like(mean_actions)
         actions = th.tanh(mean_actions + log_std.exp() * noise)

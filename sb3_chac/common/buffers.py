@@ -1,6 +1,7 @@
 """One replay buffer with two stores: what the novice drove, and what the human drove."""
 
 from collections import defaultdict, deque
+from itertools import chain
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,7 +11,9 @@ from stable_baselines3.common.buffers import BaseBuffer, ReplayBuffer
 from stable_baselines3.common.type_aliases import TensorDict
 from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_chac.common.arguments import checked
 from sb3_chac.common.checks import check_integer, check_range
+from sb3_chac.common.contract import NOVICE_ACTION, TAKEOVER, TAKEOVER_START
 
 Observation = np.ndarray | dict[str, np.ndarray]
 # Columns of a store with one number a row
@@ -84,8 +87,19 @@ class TransitionStore:
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
         filled, self.arrays = self.arrays, self._allocate()
-        for name, array in filled.items():  # one pickled before a column existed has zeros there
+        for name, array in filled.items():
             self.arrays[name][: len(array)] = array
+
+    def complete(self, columns: dict[str, tuple[tuple[int, ...], Any]]) -> None:
+        """
+        Add the columns that are missing in a store of an older version, with zeros.
+
+        :param columns: see the constructor
+        """
+        for name, (shape, dtype) in columns.items():
+            if name not in self.columns:
+                self.columns = {**self.columns, name: (shape, dtype)}
+                self.arrays[name] = np.zeros((self.capacity, *shape), dtype)
 
 
 class DualReplayBuffer(ReplayBuffer):
@@ -108,6 +122,7 @@ class DualReplayBuffer(ReplayBuffer):
     :raises ValueError: for an argument that does not fit
     """
 
+    @checked
     def __init__(
         self,
         buffer_size: int,
@@ -145,6 +160,13 @@ class DualReplayBuffer(ReplayBuffer):
         # Transitions of each environment whose return is not complete yet
         self.pending: defaultdict[int, deque[dict[str, Any]]] = defaultdict(deque)
 
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        for store in (self.novice, self.human):
+            store.complete(dict.fromkeys(SCALARS, ((1,), np.float32)))
+        for row in chain.from_iterable(self.pending.values()):
+            row |= {name: np.zeros(1, np.float32) for name in SCALARS if name not in row}
+
     def size(self) -> int:
         """
         :return: number of transitions in both stores
@@ -177,13 +199,13 @@ class DualReplayBuffer(ReplayBuffer):
                 **self._entries("observation", obs, idx),
                 **self._entries("next_observation", next_obs, idx),
                 "action": np.ravel(action[idx]),
-                "novice_action": np.ravel(info.get("novice_action", action[idx])),
+                "novice_action": np.ravel(info.get(NOVICE_ACTION, action[idx])),
                 "reward": reward[idx],
                 "discount": self.gamma,
                 "done": done[idx] and not is_timeout,
-                "takeover": bool(info.get("takeover", False)),
-                "takeover_start": bool(info.get("takeover_start", False)),
-                "cost": float(info.get("cost", 0.0)),
+                "takeover": bool(info.get(TAKEOVER, False)),
+                "takeover_start": bool(info.get(TAKEOVER_START, False)),
+                "cost": float(info.get("cost") or 0.0),  # None: not measured
             }
             if self.n_steps == 1:
                 self._append(row)
@@ -207,9 +229,7 @@ class DualReplayBuffer(ReplayBuffer):
     def _append_return(self, pending: deque[dict[str, Any]]) -> None:
         """Completes the oldest transition: rewards up to the last one, then its next observation."""
         ends = {name: value for name, value in pending[-1].items() if name == "done" or name.startswith("next_observation/")}
-        sums = {
-            name: sum(self.gamma**k * row[name] for k, row in enumerate(pending)) for name in ("reward", "cost")
-        }
+        sums = {name: sum(self.gamma**k * row[name] for k, row in enumerate(pending)) for name in ("reward", "cost")}
         self._append(pending.popleft() | ends | sums | {"discount": self.gamma ** (len(pending) + 1)})
 
     def _flush(self, pending: deque[dict[str, Any]]) -> None:

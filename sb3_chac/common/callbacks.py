@@ -9,6 +9,7 @@ from stable_baselines3.common.callbacks import BaseCallback, ProgressBarCallback
 from stable_baselines3.common.logger import CSVOutputFormat
 from tqdm.rich import FractionColumn, tqdm
 
+from sb3_chac.common.checks import number_in
 from sb3_chac.common.guided import GuidedOffPolicyAlgorithm
 
 PROGRESS_FILE = "progress.csv"
@@ -52,29 +53,35 @@ class GuidedProgressBar(ProgressBarCallback):
         """
         counts = self.model.counts
         parts = [f"{name} {getattr(self.model, name)}" for name in ("stage", "round") if hasattr(self.model, name)]
-        choices: dict[str, list[np.ndarray]] = getattr(self.model, "choices", {})
+        choices = list(getattr(self.model, "choices", ()))[-self.refresh_every :]
         if choices:  # else the logger has just taken them
-            self.self_share = float(np.mean(choices["self_drives"][-self.refresh_every :]))
+            self.self_share = float(np.mean([choice["self_drives"] for choice in choices]))
         if self.self_share is not None:
             parts.append(f"self {100 * self.self_share:.0f} %")
         rate = counts["human_steps"] / max(counts["total_steps"], 1)
         parts.append(f"human {100 * rate:.0f} % ({counts['human_steps']:.0f} steps)")
-        return ", ".join([*parts, f"cost {counts['safety_cost']:g}"])
+        if "safety_cost" in self.model.measured:
+            parts.append(f"cost {counts['safety_cost']:g}")
+        return ", ".join(parts)
 
 
 class SafetyCost(BaseCallback):
     """
-    Sums up the safety cost (``info["cost"]``, 0 where there is none) of a training whose algorithm does not, as
+    Sums up the safety cost (``info["cost"]``, if there is any) of a training whose algorithm does not, as
     ``safety/safety_cost`` of the logger and ``model.safety_cost``, which is saved with the model.
     """
 
     def _on_training_start(self) -> None:
-        if self.model.num_timesteps == 0 or not hasattr(self.model, "safety_cost"):
-            self.model.safety_cost = 0.0  # type: ignore[attr-defined]
+        if self.model.num_timesteps == 0 and hasattr(self.model, "safety_cost"):
+            del self.model.safety_cost
+        self.is_measured = hasattr(self.model, "safety_cost")
 
     def _on_step(self) -> bool:
-        self.model.safety_cost += sum(float(info.get("cost", 0.0)) for info in self.locals["infos"])  # type: ignore[attr-defined]
-        self.logger.record("safety/safety_cost", self.model.safety_cost)  # type: ignore[attr-defined]
+        costs = [number_in(info, "cost", idx) for idx, info in enumerate(self.locals["infos"])]
+        self.is_measured = self.is_measured or any(cost is not None for cost in costs)
+        if self.is_measured:  # else it would look like a zero
+            self.model.safety_cost = getattr(self.model, "safety_cost", 0.0) + sum(filter(None, costs))  # type: ignore[attr-defined]
+            self.logger.record("safety/safety_cost", self.model.safety_cost)  # type: ignore[attr-defined]
         return True
 
 
@@ -118,7 +125,8 @@ class CSVProgress(BaseCallback):
             row["chac/stage"] = self.stage
         if isinstance(self.model, GuidedOffPolicyAlgorithm):
             row["takeover/human_steps"] = self.model.counts["human_steps"]
-            row["safety/safety_cost"] = self.model.counts["safety_cost"]
+            if "safety_cost" in self.model.measured:
+                row["safety/safety_cost"] = self.model.counts["safety_cost"]
         elif hasattr(self.model, "safety_cost"):
             row["safety/safety_cost"] = self.model.safety_cost
         output.write(row, {})

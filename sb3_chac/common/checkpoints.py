@@ -1,17 +1,68 @@
 """Checkpoints from which a training that was killed goes on, see ``sb3-chac resume``."""
 
 import io
+import json
 import os
 import shutil
+import signal
+import threading
 import warnings
+import zipfile
+import zlib
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import numpy as np
+import torch as th
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 
 FOLDER = "checkpoints"  # of a run
+CONTENTS = "contents.json"  # of a checkpoint: what was written, to be compared with what is read
+BUFFER = "replay_buffer.pkl"
+KEPT = 2  # checkpoints: the newest, and the one to fall back to
 BLOCK = 2**16  # bytes
+
+
+class DamagedCheckpoint(ValueError):
+    """Raised for a checkpoint that no training can go on from; says why."""
+
+
+class StopSignals:
+    """
+    Inside the block, SIGTERM and Ctrl-C are noted and nothing else; whoever looks at ``number`` ends what runs in good order.
+    The second one does what it does elsewhere, in case that takes too long. Outside the main thread nothing is changed.
+    """
+
+    number: int | None = None
+
+    def __enter__(self) -> "StopSignals":
+        self._before: dict[int, Any] = {}
+        if threading.current_thread() is threading.main_thread():
+            self._before = {number: signal.signal(number, self._note) for number in (signal.SIGTERM, signal.SIGINT)}
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    def _note(self, number: int, frame: FrameType | None) -> None:
+        self.number = number
+        self.__exit__()
+
+
+class TrainingStopped(BaseException):
+    """
+    Raised between two rollouts, with a checkpoint behind it (not an ``Exception``: nothing went wrong).
+
+    :param number: of the signal
+    :param message: one sentence
+    """
+
+    def __init__(self, number: int, message: str):
+        super().__init__(message)
+        self.exit_code = 128 + number
 
 
 class ResumableCheckpoint(BaseCallback):
@@ -20,27 +71,44 @@ class ResumableCheckpoint(BaseCallback):
     the running statistics of ``VecNormalize``, named as RL-Zoo3's ``-i`` expects them.
 
     It is written between two rollouts, when everything collected is stored and learned from, and after the last one. The
-    folder is filled under another name and renamed once it is on the disk: whenever the process is killed, a complete one is
-    left. If it cannot be written (the disk is full), a warning is given, the older one is kept and the training goes on.
+    folder is filled under another name, read back, and renamed once it is on the disk: whenever the process is killed, a
+    complete one is left. Then all but it and the one before it are removed. If it cannot be written (the disk is full), a
+    warning is given, the older ones are kept and the training goes on.
 
     :param save_freq: number of steps (of all environments) after which the next one is written
     :param run_folder: of RL-Zoo3, e.g. logs/chac/SafeDrive-v0_1
     :param env_name: name of the environment as in RL-Zoo3's file names
     :param verbose: Verbosity level: 0 for no output, 1 for a line per checkpoint
+    :param signals: once one of them has come, a checkpoint is written and ``TrainingStopped`` raised
     """
 
-    def __init__(self, save_freq: int, run_folder: str | Path, env_name: str, verbose: int = 0):
+    def __init__(
+        self,
+        save_freq: int,
+        run_folder: str | Path,
+        env_name: str,
+        verbose: int = 0,
+        signals: StopSignals | None = None,
+    ):
         super().__init__(verbose)
         self.save_freq = save_freq
         self.folder = Path(run_folder) / FOLDER
         self.env_name = env_name
-        self.tried_at = 0  # number of steps; a training that goes on writes its first one at once
+        self.signals = signals
+        self.due_at = save_freq  # number of steps
         self.is_stored = False  # whether the transitions of the last rollout are
+
+    def _on_training_start(self) -> None:
+        steps = self.model.num_timesteps
+        self.due_at = steps if steps else self.save_freq  # a training that goes on writes its first one at once
 
     def _on_rollout_start(self) -> None:
         self.is_stored = False
-        if self.model.num_timesteps - self.tried_at >= self.save_freq:
+        stopped_by = self.signals.number if self.signals is not None else None
+        if stopped_by is not None or self.model.num_timesteps >= self.due_at:
             self.save()
+        if stopped_by is not None:
+            raise TrainingStopped(stopped_by, self.farewell(signal.Signals(stopped_by).name))
 
     def _on_step(self) -> bool:
         return True  # too early: the transition is not stored yet
@@ -52,28 +120,44 @@ class ResumableCheckpoint(BaseCallback):
         if self.is_stored and self.model.num_timesteps >= self.model._total_timesteps:
             self.save()
 
+    def farewell(self, reason: str) -> str:
+        """
+        :param reason: why it stops
+        :return: one sentence that says where the training stopped and how it goes on
+        """
+        step, newest = self.model.num_timesteps, newest_checkpoint(self.folder)
+        if newest is None:
+            return f"Stopped by {reason} at step {step}; no checkpoint could be written, nothing is there to resume from."
+        lost = step - int(newest.name)
+        loss = f", without the last {lost} steps, which could not be written" if lost else ""
+        return f"Stopped by {reason} at step {step}; go on{loss}: sb3-chac resume {self.folder.parent}"
+
     def save(self) -> None:
-        """Writes a checkpoint and removes all others."""
-        self.tried_at = self.model.num_timesteps
-        final = self.folder / str(self.tried_at)
+        """Writes a checkpoint and removes all but it and the one before it."""
+        step = self.model.num_timesteps
+        self.due_at = step + self.save_freq
+        final = self.folder / str(step)
         if final.exists():
             return
-        temporary = self.folder / f"{self.tried_at}.tmp"
+        check_finite_model(self.model)
+        temporary = self.folder / f"{step}.tmp"
         try:
             self._write(temporary)
+            verify(temporary)
             temporary.rename(final)
             sync(self.folder)
-        except OSError as error:
+        except (OSError, RuntimeError, DamagedCheckpoint) as error:  # torch turns some of the first kind into the second
             shutil.rmtree(temporary, ignore_errors=True)
             older = newest_checkpoint(self.folder)
             left = f"Should it be killed, {older} is there to resume from." if older else "There is none yet to resume from."
             warnings.warn(
-                f"No checkpoint at step {self.tried_at}, {self.folder} cannot be written: {error}. The training goes on, the "
+                f"No checkpoint at step {step}, {self.folder} cannot be written: {error}. The training goes on, the "
                 f"next attempt is in {self.save_freq} steps. {left}"
             )
             return
+        kept = [path.name for path in checkpoints(self.folder)[:KEPT]]
         for other in self.folder.iterdir():
-            if other != final:  # older, or left behind by a process that was killed
+            if other.name not in kept:  # older, or left behind by a process that was killed
                 shutil.rmtree(other, ignore_errors=True)
         if self.verbose > 0:
             print(f"Saved checkpoint {final}")
@@ -84,27 +168,47 @@ class ResumableCheckpoint(BaseCallback):
         """
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
-        with (folder / f"{self.env_name}.zip").open("wb") as file:
+        contents: dict[str, Any] = {"steps": self.model.num_timesteps, "model": f"{self.env_name}.zip"}
+        with (folder / contents["model"]).open("wb") as file:
             self.model.save(file)
-        if getattr(self.model, "replay_buffer", None) is not None:
-            with SparseWriter((folder / "replay_buffer.pkl").open("wb", buffering=0)) as file:
+        buffer = getattr(self.model, "replay_buffer", None)
+        if buffer is not None:
+            with SparseWriter((folder / BUFFER).open("wb", buffering=0)) as file:
                 self.model.save_replay_buffer(file)  # type: ignore[attr-defined]
+                contents |= {"buffer_bytes": file.tell(), "buffer_crc": file.crc, "buffer_rows": buffer.size()}
         normalize = self.model.get_vec_normalize_env()
         if normalize is not None:
             (folder / self.env_name).mkdir()
             normalize.save(str(folder / self.env_name / "vecnormalize.pkl"))
+        (folder / CONTENTS).write_text(json.dumps(contents) + "\n")
         for path in [*folder.rglob("*"), folder]:
             sync(path)
+
+
+def check_finite_model(model: BaseAlgorithm) -> None:
+    """
+    :raises ValueError: if a parameter is NaN or infinite; names it
+    """
+    for name, values in model.policy.state_dict().items():
+        if not values.isfinite().all():
+            raise ValueError(
+                f"model: {name} is NaN or infinite at step {model.num_timesteps}: no checkpoint was written, the older one is "
+                "kept. Look for values that are too large in observations, rewards and costs, or lower the learning rate."
+            )
 
 
 class SparseWriter(io.BufferedWriter):
     """
     A file in which blocks of zeros are left out (they are read as zeros): SB3's ReplayBuffer is stored with the rows that are
-    not in use yet, which may be gigabytes. The last byte written must not be zero; that of a pickle never is.
+    not in use yet, which may be gigabytes. The last byte written must not be zero; that of a pickle never is. ``crc`` is the
+    checksum of all that was written.
     """
+
+    crc = 0
 
     def write(self, data: Any) -> int:
         view = memoryview(data).cast("B")
+        self.crc = zlib.crc32(view, self.crc)
         for start in range(0, len(view), BLOCK):
             block = view[start : start + BLOCK]
             if np.frombuffer(block, dtype=bool).any():
@@ -127,14 +231,124 @@ def sync(path: Path) -> None:
         os.close(descriptor)
 
 
+def checkpoints(folder: Path) -> list[Path]:
+    """
+    :param folder: of a ``ResumableCheckpoint``
+    :return: those in it that got their name, which is a number, the newest first; those without a model are none
+    """
+    if not folder.is_dir():
+        return []
+    named = (path for path in folder.iterdir() if is_number(path.name) and any(path.glob("*.zip")))
+    return sorted(named, key=lambda path: int(path.name), reverse=True)
+
+
+def is_number(name: str) -> bool:
+    return name.isascii() and name.isdecimal()
+
+
 def newest_checkpoint(folder: Path) -> Path | None:
     """
     :param folder: of a ``ResumableCheckpoint``
     :return: the newest complete one in it, None if there is none
     """
-    if not folder.is_dir():
-        return None
-    return max((path for path in folder.iterdir() if path.name.isdigit()), key=lambda path: int(path.name), default=None)
+    return next(iter(checkpoints(folder)), None)
+
+
+def sound_checkpoint(folder: Path) -> tuple[Path | None, list[str]]:
+    """
+    :param folder: of a ``ResumableCheckpoint``
+    :return: the newest one in it that a training can go on from, None if there is none; and what is wrong with newer ones
+    """
+    problems: list[str] = []
+    for path in checkpoints(folder):
+        try:
+            verify(path)
+            return path, problems
+        except DamagedCheckpoint as error:
+            problems.append(str(error))
+    return None, problems
+
+
+def verify(folder: Path) -> None:
+    """
+    Reads a checkpoint and compares it with what was written.
+
+    :param folder: of the checkpoint
+    :raises DamagedCheckpoint: if a file is missing or damaged, or a weight is not finite
+    """
+    try:
+        written = json.loads((folder / CONTENTS).read_text()) if (folder / CONTENTS).exists() else {}
+        models = list(folder.glob("*.zip"))
+        if len(models) != 1 or written.get("model", models[0].name) != models[0].name:
+            raise DamagedCheckpoint(f"{folder} does not hold one model, but {len(models)}.")
+        data = verify_model(models[0])
+        if written and written["steps"] != data.get("num_timesteps"):
+            raise DamagedCheckpoint(f"{models[0]} is of step {data.get('num_timesteps')}, not of {written['steps']}.")
+        # Without a list of contents (older versions), the model says whether it has a buffer
+        if "buffer_crc" in written or (not written and data.get("buffer_size") is not None):
+            verify_buffer(folder / BUFFER, written)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        if isinstance(error, DamagedCheckpoint):
+            raise
+        raise DamagedCheckpoint(f"{folder} cannot be read: {error}") from error
+
+
+def verify_model(model: Path) -> dict[str, Any]:
+    """
+    :param model: saved by SB3
+    :return: its attributes, as JSON holds them
+    :raises DamagedCheckpoint: if it is damaged, or a weight is not finite
+    """
+    try:
+        with zipfile.ZipFile(model) as archive:
+            damaged = archive.testzip()
+            if damaged is not None:
+                raise DamagedCheckpoint(f"{model} is damaged: {damaged} in it.")
+            for name in archive.namelist():
+                if name.endswith(".pth"):
+                    with archive.open(name) as file:
+                        values = th.load(io.BytesIO(file.read()), map_location="cpu", weights_only=True)
+                    if not is_finite(values):
+                        raise DamagedCheckpoint(f"{model}: {name} holds numbers that are NaN or infinite.")
+            return dict(json.loads(archive.read("data")))
+    except (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, NotImplementedError) as error:
+        raise DamagedCheckpoint(f"{model} is damaged: {error}") from error
+
+
+def is_finite(values: Any) -> bool:
+    """
+    :param values: a tensor, or lists and dictionaries of them
+    """
+    if isinstance(values, th.Tensor):
+        return not values.is_floating_point() or bool(th.isfinite(values).all())
+    parts = values.values() if isinstance(values, dict) else values if isinstance(values, list | tuple) else ()
+    return all(map(is_finite, parts))
+
+
+def verify_buffer(path: Path, written: dict[str, Any]) -> None:
+    """
+    :param path: of a replay buffer; it is not unpickled
+    :param written: its size and checksum, if they are known
+    :raises DamagedCheckpoint: if it is missing or damaged
+    """
+    if not path.is_file():
+        raise DamagedCheckpoint(f"{path} is missing: the training would go on with empty stores.")
+    crc, last = 0, b""
+    with path.open("rb") as file:
+        while block := file.read(2**22):
+            crc, last = zlib.crc32(block, crc), block[-1:]
+    size = path.stat().st_size
+    if last != b"." or (written and (size, crc) != (written["buffer_bytes"], written["buffer_crc"])):
+        raise DamagedCheckpoint(f"{path} is damaged: its {size} bytes are not those that were written.")
+
+
+def stored_rows(folder: Path) -> int | None:
+    """
+    :param folder: of a checkpoint
+    :return: rows of its replay buffer, None if it has none or is too old to say
+    """
+    contents = folder / CONTENTS
+    return json.loads(contents.read_text()).get("buffer_rows") if contents.exists() else None
 
 
 def checkpoint_step(model: str | Path) -> int | None:
@@ -144,5 +358,5 @@ def checkpoint_step(model: str | Path) -> int | None:
     """
     path = Path(model).resolve()
     folder = path.parent
-    is_checkpoint = path.suffix == ".zip" and folder.name.isdigit() and folder.parent.name == FOLDER
+    is_checkpoint = path.suffix == ".zip" and is_number(folder.name) and folder.parent.name == FOLDER
     return int(folder.name) if is_checkpoint else None

@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
+FLOAT32_MAX = float(np.finfo(np.float32).max)
+
 
 class UnsupportedActionSpace(ValueError, AssertionError):
     """Raised for action spaces that an algorithm cannot act in (an ``AssertionError`` too, as in SB3)."""
@@ -29,6 +31,22 @@ def check_action_space(action_space: spaces.Space) -> None:
         raise UnsupportedActionSpace(
             f"env: the action space must have finite bounds with low < high, got {action_space}. "
             "Wrap the environment, e.g. in gymnasium.wrappers.RescaleAction or ClipAction."
+        )
+
+
+def check_driving_action(action: Any) -> None:
+    """
+    :param action: [steering, acceleration], handed to an environment
+    :raises ValueError: unless it is two finite numbers
+    """
+    try:
+        numbers = np.asarray(action, dtype=float)
+    except (TypeError, ValueError):
+        numbers = np.array(np.nan)
+    if numbers.shape != (2,) or not np.isfinite(numbers).all():
+        raise ValueError(
+            f"action must be two finite numbers, [steering, acceleration], got {action!r}. The environment did not make a "
+            "step: look for the NaN or the shape where the action comes from."
         )
 
 
@@ -68,6 +86,54 @@ def check_learning_rate(name: str, value: float | Callable[[float], float]) -> N
             raise ValueError(f"{error} Pass a rate such as 3e-4, or a schedule that stays positive.") from None
 
 
+def is_finite(values: Any) -> bool:
+    """
+    :param values: a number or an array of any kind
+    :return: whether none is NaN, infinite, or too large for the 32 bits that numbers are stored in
+    """
+    array = np.asarray(values)
+    return not np.issubdtype(array.dtype, np.floating) or bool((np.abs(array) <= FLOAT32_MAX).all())
+
+
+def number_in(info: dict[str, Any], key: str, env_idx: int) -> float | None:
+    """
+    :param info: of one step
+    :return: the number under ``key``, None if there is none: it is not measured
+    :raises ValueError: if it is no finite number
+    """
+    value = info.get(key)
+    if value is None:
+        return None
+    try:
+        number = float(np.asarray(value).item())
+    except (TypeError, ValueError):
+        number = math.nan
+    if not is_finite(number):
+        raise ValueError(
+            f"info[{key!r}] of environment {env_idx} must be a finite number at every step, got {value!r}: mend the "
+            "environment. Nothing of this step was stored; the model can still be saved."
+        )
+    return number
+
+
+def check_step(
+    observations: np.ndarray | dict[str, np.ndarray], rewards: np.ndarray, infos: list[dict[str, Any]], step: int
+) -> None:
+    """
+    :param observations: what followed, shape (n_envs, ...), or a dictionary of such arrays
+    :param rewards: shape (n_envs,)
+    :param infos: with the terminal observations and costs, if there are any
+    :param step: total number of steps so far, for the message
+    :raises ValueError: if anything is NaN or infinite; names what, and the environment
+    """
+    check_finite("reward", rewards, step)
+    check_finite("observation", observations, step)
+    for idx, info in enumerate(infos):
+        if info.get("terminal_observation") is not None:
+            check_finite("terminal observation", info["terminal_observation"], step, env_idx=idx)
+        number_in(info, "cost", idx)
+
+
 def check_finite(name: str, values: np.ndarray | dict[str, np.ndarray], step: int, env_idx: int | None = None) -> None:
     """
     :param name: what the values are ("observation", "reward"), for the message
@@ -78,10 +144,10 @@ def check_finite(name: str, values: np.ndarray | dict[str, np.ndarray], step: in
     """
     for key, value in values.items() if isinstance(values, dict) else [(None, values)]:
         array = np.asarray(value)
-        if not np.issubdtype(array.dtype, np.floating) or np.isfinite(array).all():
+        if is_finite(array):
             continue
         if env_idx is None:
-            env_idx = int(np.argmin(np.isfinite(array.reshape(len(array), -1)).all(axis=1)))
+            env_idx = next(idx for idx, row in enumerate(array) if not is_finite(row))
         raise ValueError(
             f"{name}{'' if key is None else f' {key!r}'} of environment {env_idx} is NaN or infinite at step {step}: "
             "mend the environment (stable_baselines3.common.vec_env.VecCheckNan finds the origin). "

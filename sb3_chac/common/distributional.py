@@ -4,6 +4,8 @@ import math
 
 import torch as th
 
+from sb3_chac.common.linear import is_traced
+
 
 def gaussian_surrogate_loss(
     q_values: th.Tensor,
@@ -103,4 +105,6 @@ def probability_of_improvement(
     :return: between 0 and 1, same shape; 0.5 where both distributions are the same
     """
     spread = (stds.square() + baseline_stds.square()).sqrt()
-    return th.special.ndtr((q_values - baseline_q_values) / spread)
+    score = (q_values - baseline_q_values) / spread
+    # ONNX has no ndtr, which is more precise where the probability is small
+    return 0.5 * (1 + th.erf(score / math.sqrt(2))) if is_traced() else th.special.ndtr(score)

@@ -1,8 +1,10 @@
 """One evaluation episode at a time: what acts, in which environment, and the record of it."""
 
+import copy
 import io
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import gymnasium as gym
@@ -51,6 +53,27 @@ def make_env(env: str | EnvSpec | Callable[..., gym.Env], env_kwargs: dict[str, 
         raise NotEvaluable(f"env: {env!r} cannot be made: {error}") from error
     except (TypeError, ValueError) as error:
         raise NotEvaluable(f"env: {env!r} cannot be made with env_kwargs {env_kwargs}: {error}") from error
+
+
+def registered_spec(spec: EnvSpec, source: str) -> EnvSpec:
+    """
+    A file says which environment it is about, not what is run: its entry point is the registered one, and nothing is imported.
+
+    :param spec: as read from a file
+    :param source: the file, for the message
+    :return: the registered specification, with the file's keywords and time limit
+    :raises NotEvaluable: if no such environment is registered, or it stands in wrappers
+    """
+    known = gym.registry.get(spec.id)
+    if known is None:
+        raise NotEvaluable(
+            f"{source}: the environment {spec.id!r} is not registered, and files import nothing: import the package that "
+            "registers it first."
+        )
+    if spec.additional_wrappers:
+        names = ", ".join(wrapper.name for wrapper in spec.additional_wrappers)
+        raise NotEvaluable(f"{source}: {spec.id} stands in wrappers ({names}), which are not imported from a file.")
+    return replace(known, kwargs={**known.kwargs, **spec.kwargs}, max_episode_steps=spec.max_episode_steps)
 
 
 class SavedModel(NamedTuple):
@@ -184,8 +207,9 @@ class Runner:
         terminated = truncated = False
         on_step()
         while not (terminated or truncated):
-            actions.append(self.driver(observation))
-            observation, reward, terminated, truncated, info = self.env.step(actions[-1])
+            action = self.driver(observation)
+            actions.append(copy.deepcopy(action))  # the environment may change what it is given
+            observation, reward, terminated, truncated, info = self.env.step(action)
             rewards.append(float(reward))
             costs.append(float(info.get("cost", 0.0)))
             positions.append(self._position())

@@ -22,6 +22,8 @@ from sb3_chac.chac import CHAC
 from sb3_chac.common.checks import check_integer
 from sb3_chac.common.episodes import DrivenPath, NotEvaluable, Runner, SavedModel, Task
 
+MOST_SCENARIOS = 100_000  # at once
+
 # Key of a record -> what the table calls it. The second to fourth only exist if the environment reports them.
 METRICS = {
     "return": "return",
@@ -192,7 +194,11 @@ def scenario_list(scenarios: Iterable[int] | str) -> list[int]:
         parts = [part.strip().split(":") for part in scenarios.split(",")]
         if not all(len(part) <= 2 and all(number.isdecimal() for number in part) for part in parts):
             raise NotEvaluable(f"scenarios must look like 1000:1050, 1000 or 1000,1003:1010, got {scenarios!r}.")
+        if any(len(number) > 18 for part in parts for number in part):
+            raise NotEvaluable(f"scenarios: a number is too large in {scenarios!r:.60}.")
         ranges = [range(int(part[0]), int(part[1]) if len(part) == 2 else int(part[0]) + 1) for part in parts]
+        if sum(map(len, ranges)) > MOST_SCENARIOS:
+            raise NotEvaluable(f"scenarios: {scenarios!r} are more than {MOST_SCENARIOS}, evaluate them in parts.")
         result = [number for part in ranges for number in part] if all(ranges) else []
     else:
         result = list(scenarios)

@@ -1,22 +1,25 @@
 """What the algorithms that learn from takeovers share: asking the human, storing who drove, counting."""
 
 import io
-import os
 import pathlib
 import warnings
 from collections import deque
 from typing import Any, TypeVar
 
 import numpy as np
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
-from stable_baselines3.common.type_aliases import MaybeCallback
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.utils import safe_mean
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
+from sb3_chac.common import contract
 from sb3_chac.common.buffers import DualReplayBuffer
+from sb3_chac.common.checks import check_action_space, check_finite, number_in
 from sb3_chac.common.off_policy_algorithm import CheckedOffPolicyAlgorithm
-from sb3_chac.human.demonstrations import Demonstrations, load_demonstrations
+from sb3_chac.human.demonstrations import Dataset, load_demonstrations
 
 SelfGuided = TypeVar("SelfGuided", bound="GuidedOffPolicyAlgorithm")
 
@@ -31,16 +34,20 @@ COUNTS = (
     "collisions",
     "departures",
 )
+# Count -> keys of ``info`` that measure it, the first that is there counts. highway-env's ``crashed`` stays until the end
+EVENTS = {"collisions": ("collision", "crashed"), "departures": ("out_of_road",)}
+LASTING = ("crashed",)
+STATE_OF_ENVS = ("_wrapped", "_budget", "_expected", "_events_last", "_human_was_seen")
 
 
 class GuidedOffPolicyAlgorithm(CheckedOffPolicyAlgorithm):
     """
     Base of the algorithms in whose training environments a human takes over.
 
-    While it learns, the ``InterventionWrapper`` of each training environment is armed; it is disarmed whenever ``learn`` ends,
-    so that the human never drives an evaluation. What the human drove is stored apart (``DualReplayBuffer``), with the action
-    that was executed and the one that the novice proposed. Environments that do the takeovers themselves may report them in
-    ``info["intervene_action"]`` (HIL-SERL's key).
+    While it learns, the ``InterventionWrapper`` of each training environment is armed, for the steps that are stored and for
+    no others: the human never drives an evaluation, also in the training environment; after one, new episodes are begun. What
+    the human drove is stored apart (``DualReplayBuffer``), with the action that was executed and the one that the novice
+    proposed. Environments that do the takeovers themselves may report them in ``info``, see ``contract.read_report``.
     """
 
     replay_buffer: DualReplayBuffer
@@ -58,18 +65,23 @@ class GuidedOffPolicyAlgorithm(CheckedOffPolicyAlgorithm):
         if not hasattr(self, "counts"):  # else it was loaded
             self.counts = dict.fromkeys(COUNTS, 0.0)
             self.wrapper_states: list[dict[str, int]] = []
+        if not hasattr(self, "measured"):
+            self.measured: set[str] = set()  # what is logged of ``counts`` besides the takeovers
+        self._wrapped: list[int] = []  # indices of the environments in which the human is asked
+        self._budget: int | None = None
+        self._expected: list[tuple[int, int]] | None = None  # see ``_begin_step``
         self._forget_episodes()
         self.ep_cost_buffer: deque[float] = deque(maxlen=self._stats_window_size)
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", message="`n_steps=")  # the dual buffer gets it, just above
             super()._setup_model()
 
-    def store_demonstrations(self, dataset: str | os.PathLike[str] | Demonstrations) -> None:
+    def store_demonstrations(self, dataset: Dataset) -> None:
         """
         Puts a dataset into the replay buffer, as if it had been driven: what the human drove (all of it, if the dataset does
         not say who drove) beside what the novice proposed, and the rest. It is not counted as steps of this training.
 
-        :param dataset: id or folder of a dataset of Minari, or Demonstrations
+        :param dataset: see ``load_demonstrations``
         :raises DatasetError: if it is missing, damaged or does not fit
         """
         data = load_demonstrations(dataset, self.observation_space, self.action_space)
@@ -80,24 +92,34 @@ class GuidedOffPolicyAlgorithm(CheckedOffPolicyAlgorithm):
         actions = scaled(data.actions)
         novice_actions = actions if data.novice_actions is None else scaled(data.novice_actions)
         takeovers = np.ones(len(data), dtype=bool) if data.takeovers is None else data.takeovers
-        begins_episode = np.diff(data.episodes, prepend=-1) != 0
-        starts = takeovers & (begins_episode | ~np.roll(takeovers, 1))
-        dones = data.terminations | data.truncations
+        dones = data.ends
+        starts = takeovers & (np.roll(dones, 1) | ~np.roll(takeovers, 1))
         columns = (data.observations, data.next_observations, actions, data.rewards, dones)
         for i in range(len(data)):
             info = {
-                "takeover": bool(takeovers[i]),
-                "takeover_start": bool(starts[i]),
-                "novice_action": novice_actions[i],
-                "TimeLimit.truncated": bool(data.truncations[i]),
+                contract.TAKEOVER: bool(takeovers[i]),
+                contract.TAKEOVER_START: bool(starts[i]),
+                contract.NOVICE_ACTION: novice_actions[i],
+                "TimeLimit.truncated": bool(dones[i] and not data.terminations[i]),
             }
             obs, next_obs, action, reward, done = (column[i : i + 1] for column in columns)
             self.replay_buffer.add(obs, next_obs, action, reward, done, [info])
         self.replay_buffer.end_trajectories()
+        normalize = self._vec_normalize_env
+        if normalize is not None and normalize.training and normalize.norm_obs:
+            normalize.obs_rms.update(data.observations)
+
+    @staticmethod
+    def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
+        wrapped = BaseAlgorithm._wrap_env(env, verbose, monitor_wrapper)
+        contract.check_order(wrapped)
+        check_action_space(wrapped.action_space)
+        return wrapped
 
     def _forget_episodes(self) -> None:
         self.episode_costs = np.zeros(self.n_envs)
         self.human_driving = np.zeros(self.n_envs, dtype=bool)
+        self._events_last = np.zeros((self.n_envs, len(LASTING)), dtype=bool)
 
     def _needs_human(self) -> bool:
         """Whether the human is asked in this stage of the training."""
@@ -114,6 +136,10 @@ class GuidedOffPolicyAlgorithm(CheckedOffPolicyAlgorithm):
         self.replay_buffer.end_trajectories()
         if reset_num_timesteps or self._last_obs is None:  # the environments are about to be reset
             self._forget_episodes()
+            self._expected = None
+        assert self.env is not None
+        self._wrapped = contract.wrapped_indices(self.env)
+        self._human_was_seen = bool(self._wrapped)
         prepared = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
         self._prepare_wrappers()
         if self._needs_human():
@@ -138,35 +164,91 @@ class GuidedOffPolicyAlgorithm(CheckedOffPolicyAlgorithm):
                 warnings.warn("The human could not be taken out of the training environments: do not evaluate in them.")
             raise
         self._disarm()
-        return self
-
-    def _prepare_wrappers(self) -> None:
-        """Wrappers that are new go on with the counts of those before them."""
-        assert self.env is not None
-        if not self.wrapper_states or not self.env.has_attr("load_state_dict"):
-            return
-        if len(self.wrapper_states) != self.n_envs:  # another number of environments than before: deal out the sums
-            sums = {name: sum(state[name] for state in self.wrapper_states) for name in self.wrapper_states[0]}
-            self.wrapper_states = [
-                {name: (total + idx) // self.n_envs for name, total in sums.items()} for idx in range(self.n_envs)
-            ]
-        for idx, state in enumerate(self.wrapper_states):
-            self.env.env_method("load_state_dict", state, indices=idx)
-
-    def _arm(self) -> None:
-        """Ask the human from now on."""
-        assert self.env is not None
-        if not self.env.has_attr("arm"):
+        if self._needs_human() and not self._human_was_seen:
             warnings.warn(
                 f"{type(self).__name__}: no human is in the loop. Wrap the training environments in "
                 "sb3_chac.InterventionWrapper (RL-Zoo3: env_wrapper), or report takeovers in info['intervene_action']."
             )
+        return self
+
+    def _prepare_wrappers(self) -> None:
+        """Wrappers that are new go on with the counts of those before them."""
+        if not self._wrapped:
             return
-        self.env.env_method("arm")
+        if self.wrapper_states and len(self.wrapper_states) != self.n_envs:  # deal out the sums
+            sums = {name: sum(state[name] for state in self.wrapper_states) for name in self.wrapper_states[0]}
+            self.wrapper_states = [
+                {name: (total + idx) // self.n_envs for name, total in sums.items()} for idx in range(self.n_envs)
+            ]
+        for idx in self._wrapped:
+            if self.wrapper_states:
+                self._ask_wrappers([idx], "load_state_dict", self.wrapper_states[idx])
+        self._note_wrapper_states(dict(zip(self._wrapped, self._ask_wrappers(self._wrapped, "state_dict"), strict=True)))
+        budgets = set(self._ask_wrappers(self._wrapped, "takeover_budget"))
+        if len(budgets) > 1:
+            raise ValueError(
+                f"budget: it is the human's for the whole training, but the environments name {budgets}: pass one to all."
+            )
+        (self._budget,) = budgets
+
+    def _ask_wrappers(self, indices: list[int], method: str, *args: Any) -> list[Any]:
+        assert self.env is not None
+        return contract.ask_wrappers(self.env, indices, method, *args)
+
+    def _note_wrapper_states(self, states: dict[int, dict[str, int]]) -> None:
+        nothing = {"human_steps": 0, "total_steps": 0}
+        self.wrapper_states = [states.get(idx, nothing) for idx in range(self.n_envs)]
+
+    def _arm(self) -> None:
+        """Ask the human from now on."""
+        self._ask_wrappers(self._wrapped, "arm", True)
 
     def _disarm(self) -> None:
-        if self.env is not None and self.env.has_attr("disarm"):
-            self.env.env_method("disarm")
+        if self.env is not None:
+            self._ask_wrappers(self._wrapped, "disarm")
+
+    def _begin_step(self) -> None:
+        """
+        The next step of the environments is one of the training. If somebody else has been in them since the last one (an
+        evaluation in the training environment), new episodes begin.
+        """
+        expected, self._expected = self._expected, [(-1, -1)] * len(self._wrapped)  # until the step is made
+        if self._announce_step() != expected and expected is not None:
+            self._start_over()
+            self._announce_step()
+
+    def _announce_step(self) -> list[tuple[int, int]]:
+        """
+        :return: numbers of steps and resets by others since the last one, of each wrapped environment
+        """
+        may_drive = self._may_drive()
+        if len(may_drive) == len(self._wrapped):
+            return self._ask_wrappers(self._wrapped, "begin_step", True)
+        return [self._ask_wrappers([idx], "begin_step", idx in may_drive)[0] for idx in self._wrapped]
+
+    def _may_drive(self) -> list[int]:
+        """
+        :return: indices of the environments whose human may drive the next step without exceeding the budget
+        """
+        if self._budget is None:
+            return self._wrapped
+        left = max(0, self._budget - sum(state["human_steps"] for state in self.wrapper_states))
+        return sorted(self._wrapped, key=lambda idx: not self.human_driving[idx])[:left]
+
+    def _start_over(self) -> None:
+        """Begins new episodes in all environments."""
+        assert self.env is not None
+        self.replay_buffer.end_trajectories()
+        self._forget_episodes()
+        self._last_obs = self.env.reset()  # type: ignore[assignment]
+        check_finite("observation", self._last_obs, self.num_timesteps)  # type: ignore[arg-type]
+        if self._vec_normalize_env is not None:
+            self._last_original_obs = self._vec_normalize_env.get_original_obs()
+
+    def _update_info_buffer(self, infos: list[dict[str, Any]], dones: np.ndarray | None = None) -> None:
+        super()._update_info_buffer(infos, dones)
+        assert dones is not None
+        self._expected = [(0, int(dones[idx])) for idx in self._wrapped]  # a VecEnv resets what is over
 
     def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
         """
@@ -183,6 +265,7 @@ class GuidedOffPolicyAlgorithm(CheckedOffPolicyAlgorithm):
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
     ) -> tuple[np.ndarray, np.ndarray]:
+        self._begin_step()
         # A model that has learned before does not start with random actions again
         return super()._sample_action(0 if self._n_updates else learning_starts, action_noise, n_envs)
 
@@ -195,42 +278,82 @@ class GuidedOffPolicyAlgorithm(CheckedOffPolicyAlgorithm):
         dones: np.ndarray,
         infos: list[dict[str, Any]],
     ) -> None:
+        reports = [contract.read_report(info, self.action_space, idx) for idx, info in enumerate(infos)]
         executed = np.array(buffer_action, dtype=np.float32)
         marked = []
-        for idx, info in enumerate(infos):
-            takeover = bool(info.get("takeover", "intervene_action" in info))
-            if takeover:
-                applied = info.get("applied_action", info.get("intervene_action"))
-                if applied is None:
-                    raise ValueError(
-                        f"info['takeover'] of environment {idx} is set, but what was executed is missing: add it as "
-                        "info['applied_action'], in the units of the action space."
-                    )
-                executed[idx] = self.policy.scale_action(np.asarray(applied))
-            start = bool(info.get("takeover_start", takeover and not self.human_driving[idx]))
-            marked.append({**info, "takeover": takeover, "takeover_start": start, "novice_action": buffer_action[idx]})
-            self.human_driving[idx] = takeover and not dones[idx]
+        for idx, (info, report) in enumerate(zip(infos, reports, strict=True)):
+            self._check_received(idx, info, buffer_action[idx])
+            if report.action is not None:
+                self._check_units(idx)
+                executed[idx] = contract.scaled(report.action, self.action_space, idx)
+            start = info.get(contract.TAKEOVER_START)
+            if start is None:
+                start = report.takeover and not self.human_driving[idx]
+            own = {"takeover": report.takeover, "takeover_start": bool(start), "novice_action": buffer_action[idx]}
+            marked.append({**info, **own, **{name: number_in(info, name, idx) for name in ("cost", "takeover_cost")}})
         super()._store_transition(replay_buffer, executed, new_obs, reward, dones, marked)
+        self.human_driving = np.array([report.takeover for report in reports]) & ~dones.astype(bool)
+        self._human_was_seen |= any(report.says_so for report in reports)
         self._count(marked, dones)
+
+    def _check_units(self, idx: int) -> None:
+        """
+        :param idx: of an environment that reports a takeover
+        :raises UnsupportedActionSpace: if one can see that it does so in other units than those of the algorithm
+        """
+        assert self.env is not None
+        base = self.env.unwrapped
+        if idx not in self._wrapped and isinstance(base, DummyVecEnv):
+            contract.check_report_order(base.envs[idx])
+
+    def _check_received(self, idx: int, info: dict[str, Any], sent: np.ndarray) -> None:
+        """
+        :param sent: scaled to [-1, 1]
+        :raises ValueError: if another action arrived where the human takes over than the one that was sent
+        """
+        received = info.get(contract.RECEIVED_ACTION)
+        if received is None:
+            return
+        sent = np.asarray(self.policy.unscale_action(sent), np.float64)
+        box: Any = self.action_space
+        if not np.allclose(received, sent, rtol=0, atol=contract.TOLERANCE * (box.high.astype(float) - box.low).max()):
+            raise contract.changed_action(idx, sent, received)
 
     def _count(self, infos: list[dict[str, Any]], dones: np.ndarray) -> None:
         counts = self.counts
         for idx, (info, done) in enumerate(zip(infos, dones, strict=True)):
-            cost, takeover = float(info.get("cost", 0.0)), info["takeover"]
+            takeover = info["takeover"]
             counts["total_steps"] += 1
             counts["human_steps"] += takeover
             counts["takeovers"] += info["takeover_start"]
-            counts["takeover_cost"] += info.get("takeover_cost", 0.0)
-            counts["safety_cost"] += cost
-            counts["safety_cost_human"] += cost * takeover
-            counts["collisions"] += bool(info.get("collision", False))
-            counts["departures"] += bool(info.get("out_of_road", False))
-            self.episode_costs[idx] += cost
+            counts["takeover_cost"] += info["takeover_cost"] or 0.0
+            if info["cost"] is not None:
+                self.measured |= {"safety_cost", "safety_cost_human"}
+                counts["safety_cost"] += info["cost"]
+                counts["safety_cost_human"] += info["cost"] * takeover
+                self.episode_costs[idx] += info["cost"]
+            for name, keys in EVENTS.items():
+                key = next((key for key in keys if info.get(key) is not None), None)
+                if key is not None:
+                    self.measured.add(name)
+                    counts[name] += self._happens(idx, key, bool(info[key]), bool(done))
             if done:
-                self.ep_cost_buffer.append(self.episode_costs[idx])
+                if "safety_cost" in self.measured:
+                    self.ep_cost_buffer.append(self.episode_costs[idx])
                 self.episode_costs[idx] = 0.0
-        if "human_steps" in infos[0] and "total_steps" in infos[0]:
-            self.wrapper_states = [{name: info[name] for name in ("human_steps", "total_steps")} for info in infos]
+        if self._wrapped:
+            names = ("human_steps", "total_steps")
+            self._note_wrapper_states({idx: {name: infos[idx][name] for name in names} for idx in self._wrapped})
+
+    def _happens(self, idx: int, key: str, value: bool, done: bool) -> bool:
+        """
+        :return: whether an event begins that ``info[key]`` tells of
+        """
+        if key not in LASTING:
+            return value
+        before = self._events_last[idx, LASTING.index(key)]
+        self._events_last[idx, LASTING.index(key)] = value and not done
+        return value and not before
 
     def dump_logs(self) -> None:
         counts = self.counts
@@ -238,10 +361,11 @@ class GuidedOffPolicyAlgorithm(CheckedOffPolicyAlgorithm):
             self.logger.record(f"takeover/{name}", counts[name])
         self.logger.record("takeover/rate", counts["human_steps"] / max(counts["total_steps"], 1))
         for name in ("safety_cost", "safety_cost_human", "collisions", "departures"):
-            self.logger.record(f"safety/{name}", counts[name])
+            if name in self.measured:  # else it would look like a zero
+                self.logger.record(f"safety/{name}", counts[name])
         if self.ep_cost_buffer:
             self.logger.record("rollout/ep_cost_mean", safe_mean(self.ep_cost_buffer))
         super().dump_logs()
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "episode_costs", "human_driving", "ep_cost_buffer"]
+        return [*super()._excluded_save_params(), "episode_costs", "human_driving", "ep_cost_buffer", *STATE_OF_ENVS]

@@ -12,7 +12,7 @@ from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.utils import safe_mean
 from torch import nn
 
-from sb3_chac.common.checks import check_integer, check_range
+from sb3_chac.common.checks import check_integer, check_range, is_finite
 
 
 def step_costs(infos: list[dict[str, Any]]) -> np.ndarray:
@@ -27,7 +27,7 @@ def step_costs(infos: list[dict[str, Any]]) -> np.ndarray:
             costs[idx] = float(info["cost"])
         except (KeyError, TypeError, ValueError):
             costs[idx] = math.nan
-        if not math.isfinite(costs[idx]):
+        if not is_finite(costs[idx]):
             raise ValueError(
                 f"info['cost'] of environment {idx} must be a finite number at every step, got {info.get('cost', 'none')!r}: "
                 "take an environment that reports its safety cost (SafeDrive-v0 does), or wrap this one to put it there. "

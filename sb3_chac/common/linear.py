@@ -28,10 +28,20 @@ USE_ONEDNN = th.backends.mkldnn.is_available() and hasattr(th.ops.mkldnn, "_line
 MIN_BATCH_SIZE = 32
 
 
+def is_traced() -> bool:
+    """Whether torch records what is computed (TorchScript, ONNX, ``torch.export``), to run it elsewhere."""
+    return th.jit.is_tracing() or th.compiler.is_compiling()
+
+
+def uses_onednn() -> bool:
+    """Whether to take the detour."""
+    return USE_ONEDNN and not is_traced()
+
+
 def takes_onednn(left: th.Tensor, right: th.Tensor) -> bool:
     """Whether oneDNN computes the product of two matrices."""
     is_float_matrix = left.dim() == 2 and left.dtype == right.dtype == th.float32
-    return USE_ONEDNN and is_float_matrix and left.device.type == "cpu" and len(left) >= MIN_BATCH_SIZE
+    return uses_onednn() and is_float_matrix and left.device.type == "cpu" and len(left) >= MIN_BATCH_SIZE
 
 
 def product(left: th.Tensor, right: th.Tensor, bias: th.Tensor | None = None) -> th.Tensor:
@@ -101,7 +111,7 @@ class StackedLinear(nn.Module):
         :return: shape (n_stack, batch_size, out_features)
         """
         inputs = inputs.expand(len(self.weight), *inputs.shape[-2:])
-        if USE_ONEDNN and inputs.device.type == "cpu":
+        if uses_onednn() and inputs.device.type == "cpu":
             return th.stack([linear(*layer) for layer in zip(inputs, self.weight, self.bias, strict=True)])
         return th.baddbmm(self.bias.unsqueeze(1), inputs, self.weight.transpose(1, 2))
 

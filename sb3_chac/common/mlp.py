@@ -13,7 +13,7 @@ import torch as th
 from torch import nn
 from torch.autograd.function import once_differentiable
 
-from sb3_chac.common.linear import StackedLinear, product, use_fast_linear
+from sb3_chac.common.linear import StackedLinear, is_traced, product, use_fast_linear
 
 
 class Activation(NamedTuple):
@@ -107,7 +107,7 @@ def _networks(parameters: tuple[th.Tensor, ...]) -> list[list[tuple[th.Tensor, t
     layers = list(zip(parameters[::2], parameters[1::2], strict=True))
     if parameters[0].dim() == 2:
         return [layers]
-    return list(zip(*(zip(weight, bias, strict=True) for weight, bias in layers), strict=True))  # type: ignore[arg-type]
+    return list(zip(*(zip(weight, bias, strict=True) for weight, bias in layers), strict=True))
 
 
 def _sum(tensors: list[th.Tensor]) -> th.Tensor | None:
@@ -123,7 +123,7 @@ class FastMLP(nn.Sequential):
         :param actions: shape (batch_size, n_actions), to follow the features
         :return: shape (batch_size, n_outputs); of a stack (n_stack, batch_size, n_outputs)
         """
-        if features.dim() == 2 and th.is_grad_enabled() and not (th.compiler.is_compiling() or th.jit.is_tracing()):
+        if features.dim() == 2 and th.is_grad_enabled() and not is_traced():
             activations: list[Activation | None] = []
             parameters: list[th.Tensor] = []
             for layer in self:

@@ -20,6 +20,7 @@ from sb3_chac.common.checks import (
     check_integer,
     check_learning_rate,
     check_range,
+    check_step,
 )
 
 
@@ -82,11 +83,11 @@ class CheckedOffPolicyAlgorithm(OffPolicyAlgorithm):
         dones: np.ndarray,
         infos: list[dict[str, Any]],
     ) -> None:
-        check_finite("reward", reward, self.num_timesteps)
-        check_finite("observation", new_obs, self.num_timesteps)
-        for idx, info in enumerate(infos):
-            if info.get("terminal_observation") is not None:
-                check_finite("terminal observation", info["terminal_observation"], self.num_timesteps, env_idx=idx)
+        check_finite("action", buffer_action, self.num_timesteps)
+        check_step(new_obs, reward, infos, self.num_timesteps)
+        normalize = self._vec_normalize_env
+        if normalize is not None:  # what is stored: normalizing clips what is infinite
+            check_step(normalize.get_original_obs(), normalize.get_original_reward(), [], self.num_timesteps)
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
 
     def set_parameters(

@@ -1,6 +1,5 @@
 """What the algorithms that learn from demonstrations alone (BC, CQL) share."""
 
-import os
 import sys
 import time
 from collections import defaultdict
@@ -12,12 +11,12 @@ from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_chac.common.checks import check_action_space, check_integer, check_learning_rate, check_range
-from sb3_chac.human.demonstrations import Demonstrations, check_spaces, load_demonstrations, missing_dataset
+from sb3_chac.common.utils import fix_statistics
+from sb3_chac.human.demonstrations import Dataset, Demonstrations, check_spaces, load_demonstrations, missing_dataset
 
 SelfOffline = TypeVar("SelfOffline", bound="OfflineAlgorithm")
 
@@ -93,7 +92,7 @@ class OfflineAlgorithm(BaseAlgorithm):
 
     :param policy: The policy model to use
     :param env: The environment that the dataset was recorded in (if registered in Gym, can be str)
-    :param dataset: id or folder of a dataset of Minari, or Demonstrations
+    :param dataset: see ``load_demonstrations``: id or folder of a dataset of Minari, a list of them, ...
     :param learning_rate: learning rate, it can be a function of the current progress remaining (from 1 to 0)
     :param batch_size: Minibatch size for each gradient update
     :param validation_share: share of the steps that are kept apart for validation, below 1
@@ -111,7 +110,7 @@ class OfflineAlgorithm(BaseAlgorithm):
         self,
         policy: str | type[BasePolicy],
         env: GymEnv | str,
-        dataset: str | os.PathLike[str] | Demonstrations | None,
+        dataset: Dataset | None,
         learning_rate: float | Schedule,
         batch_size: int,
         validation_share: float = 0.0,
@@ -172,7 +171,7 @@ class OfflineAlgorithm(BaseAlgorithm):
             check_action_space(env.action_space)
         return BaseAlgorithm._wrap_env(env, verbose, monitor_wrapper)
 
-    def set_dataset(self, dataset: str | os.PathLike[str] | Demonstrations | None) -> None:
+    def set_dataset(self, dataset: Dataset | None) -> None:
         """
         :param dataset: to learn from, from now on
         :raises DatasetError: if there is none, or it does not fit
@@ -197,11 +196,8 @@ class OfflineAlgorithm(BaseAlgorithm):
         if self.env is None:
             raise ValueError(f"env: pass it to {type(self).__name__}.load(..., env=...), or to set_env(), before learning.")
         prepared = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
-        normalize = self._vec_normalize_env
-        if normalize is not None and normalize.training and normalize.norm_obs:
-            assert self._demonstrations is not None
-            normalize.obs_rms = RunningMeanStd(shape=self.observation_space.shape)  # type: ignore[arg-type, assignment]
-            normalize.obs_rms.update(self._demonstrations.observations)
+        assert self._demonstrations is not None
+        fix_statistics(self._vec_normalize_env, self._demonstrations.observations)
         return prepared
 
     def learn(

@@ -3,8 +3,12 @@
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 
+import numpy as np
 import torch as th
+from stable_baselines3.common.distributions import Distribution
+from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.utils import get_parameters_by_name
+from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 
 from sb3_chac.common.checks import check_range
@@ -66,6 +70,45 @@ def frozen(params: Iterable[th.Tensor]) -> Iterator[None]:
     finally:
         for param in params:
             param.requires_grad_(True)
+
+
+class FixedStatistics(RunningMeanStd):
+    """
+    Statistics of what a model is fitted to. They stand still: an environment that is stepped does not move them away.
+
+    :param values: shape (n, ...)
+    """
+
+    def __init__(self, values: np.ndarray):
+        super().__init__(shape=values.shape[1:])
+        super().update(values)
+
+    def update(self, arr: np.ndarray) -> None:
+        pass
+
+
+def fix_statistics(normalize: VecNormalize | None, observations: np.ndarray) -> None:
+    """
+    :param normalize: of an environment; if it is in training, it normalizes by the statistics of ``observations`` from now on
+    :param observations: that a model is about to be fitted to, not normalized, shape (n, *observation_shape)
+    """
+    if normalize is not None and normalize.training and normalize.norm_obs:
+        normalize.obs_rms = FixedStatistics(observations)  # type: ignore[assignment]
+
+
+def detach_distributions(policy: nn.Module) -> None:
+    """
+    Cut what the action distributions of a policy remember of the last batch off its graph, which would keep the policy from
+    being copied (``copy.deepcopy``) and traced.
+    """
+    distributions = [module.action_dist for module in policy.modules() if hasattr(module, "action_dist")]
+    for distribution in distributions:
+        # Itself, and the torch distributions that it holds
+        for holder in (distribution, *vars(distribution).values()):
+            if isinstance(holder, Distribution | th.distributions.Distribution):
+                for name, value in vars(holder).items():
+                    if isinstance(value, th.Tensor) and value.grad_fn is not None:
+                        setattr(holder, name, value.detach())
 
 
 def initial_ent_coef(ent_coef: str | float) -> float:

@@ -1,5 +1,4 @@
 import math
-import os
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -10,11 +9,12 @@ from stable_baselines3.common.utils import FloatSchedule, update_learning_rate
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.sac.policies import Actor
 
+from sb3_chac.common.arguments import checked
 from sb3_chac.common.checks import check_action_space, check_integer, check_learning_rate, check_range
 from sb3_chac.common.offline import Batch, OfflineAlgorithm
-from sb3_chac.common.utils import TargetUpdate, frozen, initial_ent_coef, minimize
+from sb3_chac.common.utils import TargetUpdate, detach_distributions, frozen, initial_ent_coef, minimize
 from sb3_chac.cql.policies import CnnPolicy, CQLPolicy, MlpPolicy
-from sb3_chac.human.demonstrations import Demonstrations
+from sb3_chac.human.demonstrations import Dataset
 
 SelfCQL = TypeVar("SelfCQL", bound="CQL")
 
@@ -48,7 +48,7 @@ class CQL(OfflineAlgorithm):
     :param policy: The policy model to use (MlpPolicy, CnnPolicy)
     :param env: The environment that the dataset was recorded in (if registered in Gym, can be str), with a bounded Box action
         space
-    :param dataset: id or folder of a dataset of Minari, or Demonstrations
+    :param dataset: see ``load_demonstrations``: id or folder of a dataset of Minari, a list of them, ...
     :param learning_rate: learning rate of the critics, it can be a function of the current progress remaining (from 1 to 0)
     :param batch_size: Minibatch size for each gradient update
     :param tau: the soft update coefficient of the target critics (between 0 and 1)
@@ -82,11 +82,12 @@ class CQL(OfflineAlgorithm):
     critic: ContinuousCritic
     critic_target: ContinuousCritic
 
+    @checked
     def __init__(
         self,
         policy: str | type[CQLPolicy],
         env: GymEnv | str,
-        dataset: str | os.PathLike[str] | Demonstrations | None = None,
+        dataset: Dataset | None = None,
         learning_rate: float | Schedule = 3e-4,
         batch_size: int = 256,
         tau: float = 0.005,
@@ -190,6 +191,7 @@ class CQL(OfflineAlgorithm):
         ent_coef = self.policy.log_ent_coef.detach().exp()
         stats = self._update_critic(batch, ent_coef) | self._update_actor(batch, ent_coef)
         self.target_update(self.tau)
+        detach_distributions(self.policy)
         return stats
 
     def _update_critic(self, batch: Batch, ent_coef: th.Tensor) -> dict[str, th.Tensor]:

@@ -9,6 +9,7 @@ from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule, TensorDict
 
+from sb3_chac.common.arguments import checked
 from sb3_chac.common.buffers import DualReplayBuffer, DualReplayBufferSamples, take_rows
 from sb3_chac.common.checks import check_range
 from sb3_chac.common.distributional import gaussian_surrogate_loss
@@ -105,6 +106,7 @@ class DPVP(GuidedOffPolicyAlgorithm, DSAC):
     required_policy = DPVPPolicy
     policy: DPVPPolicy
 
+    @checked
     def __init__(
         self,
         policy: str | type[DPVPPolicy],

@@ -11,11 +11,12 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, PyTorch
 from stable_baselines3.common.utils import FloatSchedule, update_learning_rate
 from stable_baselines3.sac.policies import Actor
 
+from sb3_chac.common.arguments import checked
 from sb3_chac.common.checks import check_integer, check_learning_rate, check_range
 from sb3_chac.common.critics import DistributionalCritic
 from sb3_chac.common.distributional import gaussian_nll, gaussian_surrogate_loss, return_targets
 from sb3_chac.common.off_policy_algorithm import CheckedOffPolicyAlgorithm
-from sb3_chac.common.utils import TargetUpdate, frozen, initial_ent_coef, minimize
+from sb3_chac.common.utils import TargetUpdate, detach_distributions, frozen, initial_ent_coef, minimize
 from sb3_chac.dsac.policies import CnnPolicy, DSACPolicy, MlpPolicy, MultiInputPolicy
 
 SelfDSAC = TypeVar("SelfDSAC", bound="DSAC")
@@ -106,6 +107,7 @@ class DSAC(CheckedOffPolicyAlgorithm):
     critic_target: DistributionalCritic
     log_ent_coef: th.nn.Parameter
 
+    @checked
     def __init__(
         self,
         policy: str | type[DSACPolicy],
@@ -240,6 +242,7 @@ class DSAC(CheckedOffPolicyAlgorithm):
                 self.policy.reset_noise()
             for name, value in self._gradient_step(self._sample_batch(batch_size)).items():
                 stats[name].append(value)
+        detach_distributions(self.policy)
 
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         for name, values in stats.items():

@@ -1,4 +1,3 @@
-import os
 from collections import defaultdict
 from typing import Any, ClassVar, TypeVar
 
@@ -14,15 +13,17 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.utils import FloatSchedule, obs_as_tensor, update_learning_rate
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_chac.common.arguments import checked
+from sb3_chac.common.checked_rollouts import CheckedRollouts
 from sb3_chac.common.checks import check_action_space, check_integer, check_learning_rate, check_range
 from sb3_chac.common.utils import minimize
 from sb3_chac.gail.discriminator import Discriminator, discriminator_loss, imitation_rewards
-from sb3_chac.human.demonstrations import Demonstrations, check_spaces, load_demonstrations, missing_dataset
+from sb3_chac.human.demonstrations import Dataset, Demonstrations, check_spaces, load_demonstrations, missing_dataset
 
 SelfGAIL = TypeVar("SelfGAIL", bound="GAIL")
 
 
-class GAIL(PPO):
+class GAIL(CheckedRollouts, PPO):
     """
     Generative adversarial imitation learning (GAIL): PPO whose reward comes from a discriminator that learns to tell
     demonstrations from what the policy does. Paper: https://arxiv.org/abs/1606.03476 (Ho and Ermon 2016).
@@ -42,7 +43,7 @@ class GAIL(PPO):
     :param policy: The policy model to use (MlpPolicy, CnnPolicy)
     :param env: The environment to learn from (if registered in Gym, can be str), with Box observations and a bounded Box or a
         Discrete action space
-    :param dataset: id or folder of a dataset of Minari, or Demonstrations
+    :param dataset: see ``load_demonstrations``: id or folder of a dataset of Minari, a list of them, ...
     :param learning_rate: The learning rate of PPO, it can be a function
         of the current progress remaining (from 1 to 0)
     :param n_steps: The number of steps to run for each environment per update
@@ -88,11 +89,12 @@ class GAIL(PPO):
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": ActorCriticPolicy, "CnnPolicy": ActorCriticCnnPolicy}
 
+    @checked
     def __init__(
         self,
         policy: str | type[ActorCriticPolicy],
         env: GymEnv | str,
-        dataset: str | os.PathLike[str] | Demonstrations | None = None,
+        dataset: Dataset | None = None,
         learning_rate: float | Schedule = 3e-4,
         n_steps: int = 2048,
         batch_size: int = 64,
@@ -191,7 +193,7 @@ class GAIL(PPO):
             check_action_space(env.action_space)
         return BaseAlgorithm._wrap_env(env, verbose, monitor_wrapper)
 
-    def set_dataset(self, dataset: str | os.PathLike[str] | Demonstrations | None) -> None:
+    def set_dataset(self, dataset: Dataset | None) -> None:
         """
         :param dataset: to imitate from now on
         :raises DatasetError: if there is none, or it does not fit

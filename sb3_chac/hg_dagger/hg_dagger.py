@@ -1,23 +1,23 @@
 import math
-import os
 import warnings
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback, EventCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn, Schedule, TrainFreq
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_chac.bc.policies import LOSSES, BCPolicy, CnnPolicy, MlpPolicy
+from sb3_chac.common.arguments import checked
 from sb3_chac.common.buffers import DualReplayBuffer, TransitionStore
 from sb3_chac.common.checks import check_integer, check_range
 from sb3_chac.common.guided import GuidedOffPolicyAlgorithm
-from sb3_chac.common.utils import minimize
-from sb3_chac.human.demonstrations import Demonstrations, check_spaces
+from sb3_chac.common.utils import fix_statistics, minimize
+from sb3_chac.human.demonstrations import Dataset, check_spaces
 
 SelfHGDagger = TypeVar("SelfHGDagger", bound="HGDagger")
 
@@ -35,12 +35,16 @@ class HGDagger(GuidedOffPolicyAlgorithm):
     after ``n_rounds`` rounds, but at ``total_timesteps`` steps of the environment (the warm-up included) at the latest; then
     an unfinished round is learned from, too. To have more rounds later, set ``model.n_rounds``. Rewards are not used.
 
+    Under ``VecNormalize`` (in training) observations are normalized by the statistics of what is fitted, which stand still
+    from one fit to the next.
+
     What was driven is kept in the replay buffer: to go on learning with a loaded model, load that as well.
 
     :param policy: The policy model to use (MlpPolicy, CnnPolicy)
     :param env: The environment to learn from (if registered in Gym, can be str), with a bounded Box action space and in an
         ``InterventionWrapper``
-    :param dataset: what the human did before: id or folder of a dataset of Minari, or Demonstrations; may be None
+    :param dataset: what the human did before: id or folder of a dataset of Minari, a list of them, ... (see
+        ``load_demonstrations``); may be None
     :param learning_rate: learning rate, it can be a function of the current progress remaining (from 1 to 0)
     :param buffer_size: capacity of each of the two stores (human and novice), in transitions; the oldest are overwritten
     :param batch_size: Minibatch size for each gradient update
@@ -70,11 +74,12 @@ class HGDagger(GuidedOffPolicyAlgorithm):
     required_policy = BCPolicy
     policy: BCPolicy
 
+    @checked
     def __init__(
         self,
         policy: str | type[BCPolicy],
         env: GymEnv | str,
-        dataset: str | os.PathLike[str] | Demonstrations | None = None,
+        dataset: Dataset | None = None,
         learning_rate: float | Schedule = 3e-4,
         buffer_size: int = 300_000,
         batch_size: int = 256,
@@ -151,7 +156,7 @@ class HGDagger(GuidedOffPolicyAlgorithm):
         check_spaces(env.observation_space, env.action_space)
         return GuidedOffPolicyAlgorithm._wrap_env(env, verbose, monitor_wrapper)
 
-    def store_demonstrations(self, dataset: str | os.PathLike[str] | Demonstrations) -> None:
+    def store_demonstrations(self, dataset: Dataset) -> None:
         super().store_demonstrations(dataset)
         self.demonstrated_rows = self.replay_buffer.human.added
 
@@ -169,6 +174,11 @@ class HGDagger(GuidedOffPolicyAlgorithm):
                 "forgotten. Load the buffer that belongs to the model with load_replay_buffer() before learning."
             )
             self.demonstrated_rows = 0
+        if self.is_finished:
+            warnings.warn(
+                f"{type(self).__name__}: all its {self.n_rounds} rounds are done, there is nothing to learn. To have more, "
+                "set model.n_rounds."
+            )
         prepared = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
         self._set_rule()
         if self._is_round_over():
@@ -177,10 +187,8 @@ class HGDagger(GuidedOffPolicyAlgorithm):
 
     def _set_rule(self) -> None:
         """The human drives throughout the warm-up."""
-        assert self.env is not None
-        if self.env.has_attr("set_rule"):
-            self.env.env_method("set_rule", "always" if self.round == 0 else None)
-            self.env.env_method("set_stage", f"round {self.round}" if self.round else "warm-up")
+        self._ask_wrappers(self._wrapped, "set_rule", "always" if self.round == 0 else None)
+        self._ask_wrappers(self._wrapped, "set_stage", f"round {self.round}" if self.round else "warm-up")
 
     @property
     def is_finished(self) -> bool:
@@ -210,7 +218,9 @@ class HGDagger(GuidedOffPolicyAlgorithm):
         log_interval: int | None = None,
     ) -> RolloutReturn:
         if self.is_finished:
+            evaluate_now(callback)  # the last fit
             return RolloutReturn(0, 0, continue_training=False)
+        self._callback = callback
         return super().collect_rollouts(env, callback, train_freq, replay_buffer, action_noise, learning_starts, log_interval)
 
     def train(self, gradient_steps: int, batch_size: int = 256) -> None:
@@ -219,6 +229,8 @@ class HGDagger(GuidedOffPolicyAlgorithm):
             self._end_round()
         elif self.num_timesteps >= self._total_timesteps:
             self._fit()
+        if self.num_timesteps >= self._total_timesteps:
+            evaluate_now(self._callback)
 
     def _fit(self) -> None:
         """Some epochs on what was collected so far."""
@@ -226,6 +238,9 @@ class HGDagger(GuidedOffPolicyAlgorithm):
         n = len(actions)
         if n == 0:
             return
+        fix_statistics(self._vec_normalize_env, observations)
+        if self._vec_normalize_env is not None and self._last_original_obs is not None:
+            self._last_obs = self._vec_normalize_env.normalize_obs(self._last_original_obs)
         # Switch to train mode (this affects batch norm / dropout)
         self.policy.set_training_mode(True)
         self._update_learning_rate(self.policy.optimizer)
@@ -270,7 +285,7 @@ class HGDagger(GuidedOffPolicyAlgorithm):
         return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "dataset"]
+        return [*super()._excluded_save_params(), "dataset", "_callback"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "policy.optimizer"], []
@@ -281,3 +296,17 @@ def filled(store: TransitionStore) -> tuple[np.ndarray, np.ndarray]:
     :return: observations and executed actions of all rows
     """
     return store.arrays["observation/"][: len(store)], store.arrays["action"][: len(store)]
+
+
+def evaluate_now(callback: BaseCallback) -> None:
+    """
+    :param callback: those that evaluate, also inside others, do so now, whatever their frequency
+    """
+    if isinstance(callback, EvalCallback) and callback.eval_freq > 0:
+        callback.n_calls += callback.eval_freq - 1 - callback.n_calls % callback.eval_freq
+        callback.on_step()
+    elif isinstance(callback, CallbackList):
+        for one in callback.callbacks:
+            evaluate_now(one)
+    elif isinstance(callback, EventCallback) and callback.callback is not None:
+        evaluate_now(callback.callback)

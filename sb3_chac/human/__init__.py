@@ -1,5 +1,5 @@
 from sb3_chac.human.experts import Expert, FunctionExpert, ModelExpert, check_expert, make_expert
-from sb3_chac.human.intervention import ControlState, ExpertError, InterventionWrapper
+from sb3_chac.human.intervention import ControlState, ExpertError, InterventionWrapper, RuleError
 from sb3_chac.human.rules import DisagreementRule, RiskRule, TakeoverRule, always, check_rule, make_rule, never
 
 __all__ = [
@@ -11,6 +11,7 @@ __all__ = [
     "InterventionWrapper",
     "ModelExpert",
     "RiskRule",
+    "RuleError",
     "TakeoverRule",
     "always",
     "check_expert",

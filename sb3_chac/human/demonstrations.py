@@ -1,25 +1,37 @@
 """Demonstrations: datasets in Minari's format (minari.farama.org) as flat arrays. ``human.recording`` makes such datasets."""
 
+import json
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias, Union
 
 import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.vec_env import VecTransposeImage
 
+from sb3_chac.common.checks import is_finite
+from sb3_chac.common.contract import NOVICE_ACTION, TAKEOVER
+
 if TYPE_CHECKING:
     from minari import MinariDataset
 
+# What ``load_demonstrations`` takes
+Dataset: TypeAlias = Union[
+    str,
+    os.PathLike[str],
+    "Demonstrations",
+    "MinariDataset",
+    Sequence[Union[str, os.PathLike[str], "Demonstrations", "MinariDataset"]],
+]
 HOW_TO_GET_ONE = (
     "Record one with 'python -m sb3_chac demos record', fetch one with 'minari download', or list those that are there with "
     "'minari list local'."
 )
 # Names in the infos of a recording -> fields of Demonstrations. An action's info is stored at the index of what follows it
-INFOS = {"takeover": "takeovers", "novice_action": "novice_actions", "cost": "costs", "is_success": "successes"}
+INFOS = {TAKEOVER: "takeovers", NOVICE_ACTION: "novice_actions", "cost": "costs", "is_success": "successes"}
 
 
 class DatasetError(ValueError):
@@ -75,32 +87,44 @@ class Demonstrations:
     def __len__(self) -> int:
         return len(self.rewards)
 
+    @property
+    def ends(self) -> np.ndarray:
+        """Whether a step is the last one of its episode, whatever its flags say, shape (n,)."""
+        return self.terminations | self.truncations | (np.diff(self.episodes, append=self.episodes[-1:] + 1) != 0)
+
 
 def load_demonstrations(
-    dataset: str | os.PathLike[str] | Demonstrations,
+    dataset: Dataset,
     observation_space: spaces.Space | None = None,
     action_space: spaces.Space | None = None,
 ) -> Demonstrations:
     """
-    :param dataset: id of a dataset among the local ones of Minari ("safedrive/scripted-v0"), its folder, or what was loaded
-        before. It may have been recorded by others, with ``minari.DataCollector``
+    :param dataset: id of a dataset among the local ones of Minari ("safedrive/scripted-v0"), its folder, a ``MinariDataset``
+        (filtered, too), or what was loaded before; or a list of these, one after the other. It may have been recorded by
+        others, with ``minari.DataCollector``
     :param observation_space: what it must fit (images are transposed if need be), anything if None
     :param action_space: what it must fit, anything if None
     :return: all its episodes
     :raises DatasetError: if it is missing, damaged, empty or does not fit
     """
+    if isinstance(dataset, list | tuple):
+        if not dataset:
+            raise DatasetError(f"dataset: the list is empty. {HOW_TO_GET_ONE}")
+        return joined([load_demonstrations(part, observation_space, action_space) for part in dataset])
     if isinstance(dataset, Demonstrations):
         demonstrations, name = dataset, "the demonstrations"
-    elif isinstance(dataset, str | os.PathLike):
-        name = f"dataset {os.fspath(dataset)!r}"
+    elif isinstance(dataset, str | os.PathLike) or is_minari_dataset(dataset):
         opened = open_dataset(dataset)
+        name = f"dataset {os.fspath(dataset)!r}" if isinstance(dataset, str | os.PathLike) else f"dataset {opened.id!r}"
         check_spaces(opened.observation_space, opened.action_space)
         try:
             demonstrations = _read(opened)
         except Exception as error:  # h5py raises nearly anything, numpy for shapes that do not fit together
             raise _damaged(name, error) from error
     else:
-        raise DatasetError(f"dataset: must be the id or folder of a dataset, or Demonstrations, got {dataset!r}.")
+        raise DatasetError(
+            f"dataset: must be the id or folder of a dataset, a MinariDataset, Demonstrations or a list, got {dataset!r}."
+        )
     _check_arrays(demonstrations, name)
     for kind, expected in [("observation", observation_space), ("action", action_space)]:
         if expected is None:
@@ -118,22 +142,88 @@ def load_demonstrations(
     return demonstrations
 
 
-def open_dataset(dataset: str | os.PathLike[str]) -> "MinariDataset":
+def joined(parts: Sequence[Demonstrations]) -> Demonstrations:
     """
-    :param dataset: id of a local dataset of Minari, or its folder
-    :raises DatasetError: if it is missing, damaged or empty
+    :param parts: at least one
+    :return: all their episodes, one after the other; what is not recorded in each of them is left out, but for who drove:
+        where it is not told, the human drove all of it
+    :raises DatasetError: if their spaces differ
+    """
+    first = parts[0]
+    for part in parts:
+        for kind in ("observation", "action"):
+            difference = space_difference(getattr(part, f"{kind}_space"), getattr(first, f"{kind}_space"))
+            if difference:
+                raise DatasetError(f"dataset: the {kind} spaces of the datasets of the list differ in {difference}.")
+    if any(part.takeovers is not None for part in parts):
+        parts = [part if part.takeovers is not None else replace(part, takeovers=np.ones(len(part), bool)) for part in parts]
+    if any(part.novice_actions is not None for part in parts):
+        parts = [part if part.novice_actions is not None else replace(part, novice_actions=part.actions) for part in parts]
+    episodes, offset = [], 0
+    for part in parts:
+        numbers = np.cumsum(np.diff(part.episodes, prepend=part.episodes[:1]) != 0)
+        episodes.append(numbers + offset)
+        offset += int(numbers[-1]) + 1
+    columns: dict[str, Any] = {}
+    for field in fields(Demonstrations):
+        values = [getattr(part, field.name) for part in parts]
+        if field.name not in ("observation_space", "action_space", "episodes"):
+            columns[field.name] = None if any(value is None for value in values) else np.concatenate(values)
+    return replace(first, episodes=np.concatenate(episodes), **columns)
+
+
+def is_minari_dataset(dataset: Any) -> bool:
+    """
+    :return: whether it is a ``MinariDataset``
     """
     from minari import MinariDataset
 
-    folder = find_dataset(dataset)
+    return isinstance(dataset, MinariDataset)
+
+
+def open_dataset(dataset: "str | os.PathLike[str] | MinariDataset") -> "MinariDataset":
+    """
+    :param dataset: id of a local dataset of Minari, its folder, or what was opened before
+    :raises DatasetError: if it is missing, damaged, empty, or made by a version of Minari that the installed one cannot read
+    """
+    from minari import MinariDataset
+
+    if isinstance(dataset, MinariDataset):
+        opened, name = dataset, f"dataset {dataset.id!r}"
+    else:
+        folder, name = find_dataset(dataset), f"dataset {os.fspath(dataset)!r}"
+        check_version(folder, name)
+        try:
+            opened = MinariDataset(folder)
+        except Exception as error:  # whatever a damaged file leads to
+            raise _damaged(name, error) from error
     try:
-        opened = MinariDataset(folder)
-        empty = opened.total_episodes == 0 or opened.total_steps == 0
-    except Exception as error:  # whatever a damaged file, or one of another version, leads to
-        raise _damaged(f"dataset {os.fspath(dataset)!r}", error) from error
+        empty = len(opened.episode_indices) == 0 or opened.total_steps == 0
+    except Exception as error:
+        raise _damaged(name, error) from error
     if empty:
-        raise DatasetError(f"dataset {os.fspath(dataset)!r} holds no steps. {HOW_TO_GET_ONE}")
+        raise DatasetError(f"{name} holds no steps. {HOW_TO_GET_ONE}")
     return opened
+
+
+def check_version(folder: Path, name: str) -> None:
+    """
+    :param folder: that holds the data
+    :param name: of the dataset, for the message
+    :raises DatasetError: if the installed Minari cannot read what another version has written
+    """
+    from minari import __version__, supported_dataset_versions
+
+    try:
+        version = json.loads((folder / "metadata.json").read_text())["minari_version"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return  # not Minari's, which it says itself
+    if version not in supported_dataset_versions:
+        raise DatasetError(
+            f"{name} was made by Minari {version}, which the installed Minari {__version__} cannot read (only "
+            f"{', '.join(sorted(supported_dataset_versions))}). Install a version that can (pip install minari=={version}), "
+            "or record or download the dataset anew."
+        )
 
 
 def find_dataset(dataset: str | os.PathLike[str]) -> Path:
@@ -273,22 +363,25 @@ def _check_arrays(demonstrations: Demonstrations, name: str) -> None:
             continue
         if values.shape != shape:
             raise _damaged(name, f"{field} have shape {values.shape} instead of {shape}")
-        finite = np.isfinite(values).reshape(steps, -1).all(axis=1)
-        if not finite.all():
-            raise _damaged(name, f"{field} are NaN or infinite at step {int(np.argmin(finite))}")
+        if not is_finite(values):
+            step = next(step for step in range(steps) if not is_finite(values[step]))
+            raise _damaged(name, f"{field} are NaN or infinite at step {step}")
     if isinstance(action_space, spaces.Discrete):
         low, high = np.array(action_space.start), np.array(action_space.start + action_space.n - 1)
     else:
         assert isinstance(action_space, spaces.Box)
         low, high = action_space.low.astype(float), action_space.high.astype(float)
     tolerance = np.nan_to_num(1e-6 * (high - low), posinf=0.0)  # for rounding
-    outside = ((demonstrations.actions < low - tolerance) | (demonstrations.actions > high + tolerance)).reshape(steps, -1)
-    if outside.any():
-        step = int(np.argmax(outside.any(axis=1)))
-        raise DatasetError(
-            f"{name}: the action of step {step} is out of bounds, {demonstrations.actions[step]} is not in {action_space}. "
-            "Record what the environment executes: clip the actions before they are recorded."
-        )
+    for whose, values in (("", demonstrations.actions), ("novice's ", demonstrations.novice_actions)):
+        if values is None:
+            continue
+        outside = ((values < low - tolerance) | (values > high + tolerance)).reshape(steps, -1).any(axis=1)
+        if outside.any():
+            step = int(np.argmax(outside))
+            raise DatasetError(
+                f"{name}: the {whose}action of step {step} is out of bounds, {values[step]} is not in {action_space}. "
+                "Record what the environment executes: clip the actions before they are recorded."
+            )
 
 
 def _channels_first(demonstrations: Demonstrations) -> Demonstrations:

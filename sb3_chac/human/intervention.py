@@ -1,3 +1,4 @@
+import copy
 from enum import StrEnum
 from typing import Any
 
@@ -7,13 +8,19 @@ from gymnasium import spaces
 from gymnasium.error import ResetNeeded
 from gymnasium.utils import RecordConstructorArgs
 
-from sb3_chac.common.checks import check_action_space, check_integer
-from sb3_chac.human.experts import Expert, check_expert, expert_name, make_expert
+from sb3_chac.common import contract
+from sb3_chac.common.arguments import checked
+from sb3_chac.common.checks import check_action_space, check_integer, check_range
+from sb3_chac.human.experts import Expert, check_expert, expert_name, make_expert, within
 from sb3_chac.human.rules import TakeoverRule, check_rule, make_rule, scale_action
 
 
 class ExpertError(RuntimeError):
     """Raised when the expert fails or hands in something that is no action. The environment has not made the step."""
+
+
+class RuleError(RuntimeError):
+    """Raised when the rule fails or does not say who drives. The environment has not made the step."""
 
 
 class ControlState(StrEnum):
@@ -34,28 +41,30 @@ TRANSITIONS = {
 }
 
 
-class InterventionWrapper(gym.Wrapper, RecordConstructorArgs):
+class InterventionWrapper(contract.TakeoverWrapper, RecordConstructorArgs):
     """
     A stand-in for the human who watches the novice (the agent), takes over and hands back.
 
     It is inert until armed: actions pass through, the expert is neither built nor called, so that evaluation and loaded models
-    are never driven by it. Algorithms arm their training environments with ``vec_env.env_method("arm")``, and disarm them.
+    are never driven by it. Algorithms arm their training environments step by step, see ``begin_step``, and disarm them.
     When armed, the expert acts on the observation before each step, the rule decides, and either action is executed. The
-    ``info`` of each step, armed or not, says what happened:
+    ``info`` of each step, armed or not, says what happened (the keys are those of ``sb3_chac.common.contract``):
 
     ==================  ==========  ==============================================================================
     takeover            bool        the human drove this step
     takeover_start      bool        it is the first step of a takeover
     applied_action      np.ndarray  what was executed, a copy, in the units and dtype of the action space
-    takeover_cost       float       on the first step of a takeover 1 - cos(novice action, expert action), both
+    received_action     np.ndarray  what the novice proposed, as it arrived here, while the human watches
+    takeover_cost       float       on the first step of a takeover 1 - cos(novice action, human's action), both
                                     scaled to [-1, 1]: 0 (same direction) to 2 (opposite); 0 if either is zero
-    cost                float       the environment's, 0 if it has none
-    intervene_action    np.ndarray  the expert's action, on takeover steps only (HIL-SERL's key)
+    intervene_action    np.ndarray  the human's action, on takeover steps (HIL-SERL's key)
     is_intervention     bool        as ``takeover`` (the key of gym-hil and LeRobot)
     human_steps         int         steps that the human drove so far
     total_steps         int         steps made while armed so far
     takeover_rate       float       human_steps / total_steps
     ==================  ==========  ==============================================================================
+
+    A takeover that the environment itself reports (see ``contract.read_report``) is one, whatever the rule says.
 
     An error of the expert, the rule or the environment ends the episode: the next ``step`` needs a ``reset``. The expert is
     seeded by ``reset(seed=...)``, also when it is armed later. An expert or rule object that remembers must not be shared by
@@ -65,13 +74,18 @@ class InterventionWrapper(gym.Wrapper, RecordConstructorArgs):
     :param expert: who drives during a takeover: the name of a scripted driver of ``env``, a model, an ``Expert`` or a function
         observation -> action, see ``make_expert``
     :param rule: when: "risk", "disagreement", "always", "never", a ``TakeoverRule`` or a function, see ``make_rule``
-    :param budget: how many steps the human drives at most (of this environment, over all episodes), None for no limit
+    :param budget: how many steps the human drives at most, over all episodes, None for no limit. Among the copies of an
+        environment that an algorithm trains in, it is shared
     :param armed: whether to arm it at once
+    :param deadline: seconds that the expert and the rule have for each answer, None for as long as they need. With one, they
+        are asked in a thread of their own, which is left to itself if it is late
     :param rule_kwargs: of the rule if it is "risk" (e.g. ``{"take_over_below": 1.8}``, see ``RiskRule``) or "disagreement"
     :raises ValueError: for an argument that does not fit; while armed, for an action that is not finite or of another shape
-    :raises ExpertError: from ``reset``, ``step`` and ``arm`` when the expert fails
+    :raises ExpertError: from ``reset``, ``step`` and ``arm`` when the expert fails or is late
+    :raises RuleError: likewise, of the rule
     """
 
+    @checked
     def __init__(
         self,
         env: gym.Env,
@@ -80,10 +94,18 @@ class InterventionWrapper(gym.Wrapper, RecordConstructorArgs):
         budget: int | None = None,
         armed: bool = False,
         rule_kwargs: dict[str, Any] | None = None,
+        deadline: float | None = None,
     ):
         # Not copied: a model may hold a replay buffer or subprocesses
         RecordConstructorArgs.__init__(
-            self, _disable_deepcopy=True, expert=expert, rule=rule, budget=budget, armed=armed, rule_kwargs=rule_kwargs
+            self,
+            _disable_deepcopy=True,
+            expert=expert,
+            rule=rule,
+            budget=budget,
+            armed=armed,
+            rule_kwargs=rule_kwargs,
+            deadline=deadline,
         )
         gym.Wrapper.__init__(self, env)
         check_action_space(env.action_space)
@@ -92,12 +114,19 @@ class InterventionWrapper(gym.Wrapper, RecordConstructorArgs):
         check_rule(rule, expert, rule_kwargs)
         if budget is not None:
             check_integer("budget", budget, low=0)
-        self.budget = budget
+        if deadline is not None:
+            check_range("deadline", deadline, low=0.0, exclusive_low=True)
+        self.budget, self.deadline = budget, deadline
         self._expert_argument, self._rule_arguments = expert, (rule, rule_kwargs)
         self._rule_in_force = self._rule_arguments
         self._expert: Expert | None = None  # both are built when first armed
         self._rule: TakeoverRule | None = None
         self._armed = False
+        self._step_by_step = False
+        self._is_granted = self._may_drive = False  # of the next step, see ``begin_step``
+        self._foreign_steps = self._resets = 0  # since the last one that was granted
+        self._has_to_start = False
+        self._was_reported = False  # a takeover, by the environment, in the step before
         self._state = ControlState.AUTONOMOUS
         self._human_steps = 0
         self._total_steps = 0
@@ -127,10 +156,11 @@ class InterventionWrapper(gym.Wrapper, RecordConstructorArgs):
     def takeover_rate(self) -> float:
         return self._human_steps / self._total_steps if self._total_steps else 0.0
 
-    def arm(self) -> None:
+    def arm(self, step_by_step: bool = False) -> None:
         """
         From the next step on the human watches, also in the middle of an episode. Does nothing if armed already.
 
+        :param step_by_step: only in the steps that ``begin_step`` announces; in all others the wrapper is inert
         :raises ValueError: if the environment does not know the expert, or "risk" is the rule and the expert predicts nothing
         """
         if self._armed:
@@ -140,17 +170,31 @@ class InterventionWrapper(gym.Wrapper, RecordConstructorArgs):
             rule, rule_kwargs = self._rule_in_force
             self._rule = make_rule(rule, self.env, expert, rule_kwargs)
             self._expert = expert
+        self._step_by_step = step_by_step
         if self._budget_is_spent():
             self._on("pause")
         else:
-            self._start()
+            self._start_now_or_when_granted()
         self._armed = True
+
+    def begin_step(self, may_drive: bool) -> tuple[int, int]:
+        """
+        Announce that the next step is one of the training: nobody else's (an evaluation in the same environment) is watched,
+        driven or counted by the human.
+
+        :param may_drive: whether the human may drive it
+        :return: number of steps and resets since the last one that were not announced
+        """
+        made = self._foreign_steps, self._resets
+        self._foreign_steps = self._resets = 0
+        self._is_granted, self._may_drive = True, may_drive
+        return made
 
     def disarm(self) -> None:
         """Ends a takeover and a pause; from the next step on the wrapper is inert. The counts are kept."""
         self._on("hand back")
         self._on("resume")
-        self._armed = False
+        self._armed = self._has_to_start = self._is_granted = False
 
     def set_rule(self, rule: Any = None) -> None:
         """
@@ -184,50 +228,66 @@ class InterventionWrapper(gym.Wrapper, RecordConstructorArgs):
         self._check_armed("resume")
         if self._state is ControlState.PAUSED and not self._budget_is_spent():
             self._on("resume")
-            self._start()
+            self._start_now_or_when_granted()
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         self._observation = None
         self._on("hand back")
+        self._was_reported = False
+        self._resets += 1
         observation, info = self.env.reset(seed=seed, options=options)
-        self._observation = observation
+        self._observation = copy.deepcopy(observation)
         if seed is not None:
             self._seed = seed
         if self._armed and self._state is not ControlState.PAUSED:
-            self._start()
+            self._start_now_or_when_granted()
         return observation, info
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        novice_action = self._checked_novice_action(action) if self._armed else np.array(action, self._box.dtype)
+        is_granted, self._is_granted = self._is_granted, False
+        self._foreign_steps += not is_granted
+        watches = self._armed and (is_granted or not self._step_by_step)
+        if watches and self._has_to_start:
+            self._has_to_start = False
+            self._start()
+        novice_action = self._checked_novice_action(action) if watches else np.array(action, self._box.dtype)
+        received_action = {contract.RECEIVED_ACTION: np.array(action, np.float64)} if watches else {}
         # If anything below fails it stays so: the human does not drive, and only reset() goes on
         observation, self._observation = self._observation, None
         was_driving = self._state is ControlState.TAKEOVER
         self._on("hand back")
 
-        takeover, executed, applied_action, takeover_cost = False, action, novice_action, 0.0
-        if self._armed and self._state is not ControlState.PAUSED:
+        drives, executed, applied_action = False, action, novice_action
+        if watches and self._state is not ControlState.PAUSED and (self._may_drive or not self._step_by_step):
             expert_action = self._ask_expert(observation)
-            takeover = self._ask_rule(observation, novice_action, expert_action, was_driving)
-            if takeover:
+            drives = self._ask_rule(observation, novice_action, expert_action, was_driving)
+            if drives:
                 executed, applied_action = expert_action.copy(), expert_action
-            if takeover and not was_driving:
-                takeover_cost = self._cosine_distance(novice_action, expert_action)
         observation, reward, terminated, truncated, info = self.env.step(executed)
+        report = self._read_report(info)
+        takeover = drives or report.takeover
+        starts = takeover and not (was_driving or self._was_reported)
+        if report.action is not None:
+            applied_action = report.action.astype(self._box.dtype)
 
-        self._total_steps += self._armed
-        self._human_steps += takeover
-        if not (terminated or truncated):
-            self._observation = observation
-            self._on("take over" if takeover else "hand back")
+        is_over = terminated or truncated
+        self._was_reported = report.takeover and not is_over
+        self._total_steps += watches
+        self._human_steps += watches and takeover
+        if not is_over:
+            self._observation = copy.deepcopy(observation)
+            self._on("take over" if drives else "hand back")
+        if self._armed and not watches:
+            self._has_to_start = True
         if self._armed and self._budget_is_spent():
             self._on("pause")
         info = {
-            "cost": 0.0,
             **info,
-            "takeover": takeover,
-            "takeover_start": takeover and not was_driving,
-            "applied_action": applied_action,
-            "takeover_cost": takeover_cost,
+            **received_action,
+            contract.TAKEOVER: takeover,
+            contract.TAKEOVER_START: starts,
+            contract.APPLIED_ACTION: applied_action,
+            "takeover_cost": self._cosine_distance(novice_action, applied_action) if starts else 0.0,
             "is_intervention": takeover,
             "human_steps": self._human_steps,
             "total_steps": self._total_steps,
@@ -235,7 +295,14 @@ class InterventionWrapper(gym.Wrapper, RecordConstructorArgs):
         }
         if takeover:
             info["intervene_action"] = applied_action.copy()
-        return observation, reward, terminated, truncated, info
+        # A copy: environments that reuse the array would overwrite what VecEnvs keep of the end of an episode
+        return copy.deepcopy(observation), reward, terminated, truncated, info
+
+    def _read_report(self, info: dict[str, Any]) -> contract.Report:
+        report = contract.read_report(info, self._box)
+        if report.takeover:
+            contract.check_report_order(self.env)
+        return report
 
     def set_stage(self, stage: str | int) -> None:
         """
@@ -245,7 +312,7 @@ class InterventionWrapper(gym.Wrapper, RecordConstructorArgs):
 
     @property
     def hud(self) -> dict[str, Any]:
-        """What an environment with an attribute ``hud`` may display."""
+        """What a ``TakeoverDisplay`` may show."""
         return {
             "takeover": self._state is ControlState.TAKEOVER,
             "steps": self._total_steps,
@@ -254,7 +321,7 @@ class InterventionWrapper(gym.Wrapper, RecordConstructorArgs):
         }
 
     def render(self) -> Any:
-        if hasattr(self.unwrapped, "hud"):
+        if isinstance(self.unwrapped, contract.TakeoverDisplay):
             self.unwrapped.hud = self.hud
         return self.env.render()
 
@@ -286,6 +353,12 @@ class InterventionWrapper(gym.Wrapper, RecordConstructorArgs):
         if not self._armed:
             raise RuntimeError(f"{name}() needs an armed InterventionWrapper: call arm() first.")
 
+    def _start_now_or_when_granted(self) -> None:
+        if self._step_by_step:
+            self._has_to_start = True
+        else:
+            self._start()
+
     def _start(self) -> None:
         """Tells expert and rule that they are asked from now on; before the first reset() there is nothing to look at yet."""
         if self._observation is None:
@@ -293,10 +366,13 @@ class InterventionWrapper(gym.Wrapper, RecordConstructorArgs):
         assert self._expert is not None and self._rule is not None
         observation, self._observation = self._observation, None  # stays None if anything fails
         try:
-            self._expert.reset(seed=self._seed)
+            within(self.deadline, self._expert.reset, seed=self._seed)
         except Exception as error:
             raise self._expert_error(f"raised {type(error).__name__} in its reset: {error}.") from error
-        self._rule.reset()
+        try:
+            within(self.deadline, self._rule.reset)
+        except Exception as error:
+            raise self._rule_error(f"raised {type(error).__name__} in its reset: {error}.") from error
         self._observation, self._seed = observation, None
 
     def _ask_expert(self, observation: Any) -> np.ndarray:
@@ -305,7 +381,7 @@ class InterventionWrapper(gym.Wrapper, RecordConstructorArgs):
         """
         assert self._expert is not None
         try:
-            values = np.array(self._expert(observation), dtype=np.float64)
+            values = np.array(within(self.deadline, self._expert, copy.deepcopy(observation)), dtype=np.float64)
         except Exception as error:
             raise self._expert_error(f"raised {type(error).__name__}: {error}.") from error
         low, high = self._box.low.astype(np.float64), self._box.high.astype(np.float64)
@@ -328,10 +404,23 @@ class InterventionWrapper(gym.Wrapper, RecordConstructorArgs):
 
     def _ask_rule(self, observation: Any, novice_action: np.ndarray, expert_action: np.ndarray, was_driving: bool) -> bool:
         assert self._rule is not None
-        takeover = self._rule(observation, novice_action, expert_action, was_driving)
+        # Copies: it may keep or change what it is given
+        asked = copy.deepcopy(observation), novice_action.copy(), expert_action.copy(), was_driving
+        try:
+            takeover = within(self.deadline, self._rule, *asked)
+        except Exception as error:
+            raise self._rule_error(f"raised {type(error).__name__}: {error}.") from error
         if not isinstance(takeover, bool | np.bool_):
-            raise TypeError(f"rule must return True or False, got {takeover!r} from {self._rule_in_force[0]!r}.")
+            raise self._rule_error(f"must return True or False, got {takeover!r}.")
         return bool(takeover)
+
+    def _rule_error(self, problem: str) -> RuleError:
+        rule = self._rule_in_force[0]
+        name = repr(rule) if isinstance(rule, str) else getattr(rule, "__qualname__", type(rule).__name__)
+        return RuleError(
+            f"The rule {name} {problem} The environment did not make a step. Mend the rule or pass another as rule=..., and "
+            "go on with reset()."
+        )
 
     def _checked_novice_action(self, action: Any) -> np.ndarray:
         if self._observation is None:

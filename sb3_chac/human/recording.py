@@ -1,6 +1,7 @@
 """Recording demonstrations: episodes of an expert, or of a novice whom an expert watches, as a dataset of Minari."""
 
 import contextlib
+import copy
 import itertools
 import multiprocessing
 import os
@@ -22,6 +23,7 @@ from stable_baselines3.common.vec_env.base_vec_env import CloudpickleWrapper
 from tqdm import tqdm
 
 from sb3_chac.common.checks import check_integer
+from sb3_chac.common.contract import NOVICE_ACTION, TAKEOVER, read_report
 from sb3_chac.common.episodes import Runner, SavedModel, Task, make_env
 from sb3_chac.common.evaluation import policy_name, saved_model, scenario_list
 from sb3_chac.human.dataset_writer import DatasetWriter, folder_to_make
@@ -159,13 +161,15 @@ class Recorder(Runner):
         truncations: list[bool] = []
         while not rewards or not (terminations[-1] or truncations[-1]):
             action = self._in_space(self.driver(observation))
+            proposed = copy.deepcopy(action)  # the environment may change what it is given
             observation, reward, terminated, truncated, info = self.env.step(action)
             observations.append(np.array(observation))
-            actions.append(info.get("applied_action", action))
+            executed = read_report(info, self.env.action_space).action
+            actions.append(proposed if executed is None else executed)
             rewards.append(float(reward))
             terminations.append(bool(terminated))
             truncations.append(bool(truncated))
-            steps.append(self.stored_infos(action, info))
+            steps.append(self.stored_infos(proposed, info, self.env.action_space))
         stacked = np.array(observations, self.env.observation_space.dtype)
         if not (np.isfinite(stacked).all() and np.isfinite(rewards).all()):
             raise ValueError(f"episode {number} of {self.env.unwrapped} has NaN or infinite values: mend the environment.")
@@ -189,16 +193,17 @@ class Recorder(Runner):
         return int(action) if isinstance(space, spaces.Discrete) else np.array(action, space.dtype)
 
     @staticmethod
-    def stored_infos(action: Any, info: dict[str, Any]) -> dict[str, Any]:
+    def stored_infos(action: Any, info: dict[str, Any], action_space: spaces.Space) -> dict[str, Any]:
         """
         :param action: what the novice proposed, if there is one
         :param info: of the step
+        :param action_space: of the environment
         :return: what a dataset holds of the step besides what Minari asks for
         """
-        watched = "takeover" in info
+        report = read_report(info, action_space)
         return {
-            "takeover": bool(info["takeover"]) if watched else True,
-            **({"novice_action": np.array(action)} if watched else {}),
+            TAKEOVER: report.takeover or not report.says_so,
+            **({NOVICE_ACTION: np.array(action)} if report.says_so else {}),
             **{key: kind(info[key]) for key, kind in (("cost", float), ("is_success", bool)) if key in info},
         }
 

@@ -9,6 +9,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
+from sb3_chac.common.arguments import checked
 from sb3_chac.common.checks import check_action_space, check_integer, check_range
 
 RULE_NAMES = ("risk", "disagreement", "always", "never")
@@ -49,6 +50,7 @@ class RiskRule:
     :raises ValueError: for an argument out of its range, or a prediction that is NaN
     """
 
+    @checked
     def __init__(
         self,
         time_to_trouble: Callable[[Any, np.ndarray], float],
@@ -113,6 +115,7 @@ class DisagreementRule:
     :raises ValueError: for a negative threshold, or an action space that is not a bounded Box
     """
 
+    @checked
     def __init__(self, threshold: float, action_space: spaces.Box):
         check_range("threshold", threshold, low=0.0)
         check_action_space(action_space)

@@ -13,15 +13,18 @@ from stable_baselines3.common.utils import explained_variance, obs_as_tensor
 from stable_baselines3.common.vec_env import VecEnv
 from torch.nn import functional as F
 
+from sb3_chac.common.arguments import checked
+from sb3_chac.common.checked_rollouts import CheckedRollouts
 from sb3_chac.common.checks import check_learning_rate, check_range
 from sb3_chac.common.lagrange import CostConstrainedAlgorithm, constrained_advantages
+from sb3_chac.common.utils import detach_distributions
 from sb3_chac.ppo_lag.buffers import CostDictRolloutBuffer, CostRolloutBuffer, CostRolloutBufferSamples
 from sb3_chac.ppo_lag.policies import CnnPolicy, CostActorCriticPolicy, MlpPolicy, MultiInputPolicy
 
 SelfPPOLag = TypeVar("SelfPPOLag", bound="PPOLag")
 
 
-class PPOLag(CostConstrainedAlgorithm, PPO):
+class PPOLag(CostConstrainedAlgorithm, CheckedRollouts, PPO):
     """
     PPO-Lagrangian: PPO that keeps the mean cost of an episode (the sum of ``info["cost"]``) below a limit, with the PID
     multiplier of https://arxiv.org/abs/2007.03964 (Stooke et al. 2020), see ``PIDLagrangian``.
@@ -94,6 +97,7 @@ class PPOLag(CostConstrainedAlgorithm, PPO):
     policy: CostActorCriticPolicy
     rollout_buffer: CostRolloutBuffer
 
+    @checked
     def __init__(
         self,
         policy: str | type[CostActorCriticPolicy],
@@ -264,6 +268,7 @@ class PPOLag(CostConstrainedAlgorithm, PPO):
             self._n_updates += 1
             if not continue_training:
                 break
+        detach_distributions(self.policy)
 
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         self._record_multiplier()

@@ -7,6 +7,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.utils import polyak_update
 from stable_baselines3.td3.policies import TD3Policy
 
+from sb3_chac.common.arguments import checked
 from sb3_chac.common.buffers import DualReplayBuffer, DualReplayBufferSamples, take_rows
 from sb3_chac.common.checks import check_integer, check_range
 from sb3_chac.common.guided import GuidedOffPolicyAlgorithm
@@ -71,6 +72,7 @@ class PVP(GuidedOffPolicyAlgorithm, TD3):
 
     required_policy = TD3Policy
 
+    @checked
     def __init__(
         self,
         policy: str | type[TD3Policy],

@@ -12,10 +12,11 @@ from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy, ContinuousCritic
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 
-from sb3_chac.common.checks import check_integer
+from sb3_chac.common.arguments import checked
+from sb3_chac.common.checks import check_integer, check_range
 from sb3_chac.common.lagrange import CostConstrainedAlgorithm, constrained_actor_loss
 from sb3_chac.common.off_policy_algorithm import CheckedOffPolicyAlgorithm
-from sb3_chac.common.utils import TargetUpdate, frozen, minimize
+from sb3_chac.common.utils import TargetUpdate, detach_distributions, frozen, initial_ent_coef, minimize
 from sb3_chac.sac_lag.buffers import CostNStepReplayBuffer, CostReplayBuffer, CostReplayBufferSamples, default_buffer_class
 from sb3_chac.sac_lag.policies import CnnPolicy, MlpPolicy, MultiInputPolicy, SACLagPolicy
 
@@ -103,6 +104,7 @@ class SACLag(CostConstrainedAlgorithm, CheckedOffPolicyAlgorithm, SAC):
     cost_critic: ContinuousCritic
     cost_critic_target: ContinuousCritic
 
+    @checked
     def __init__(
         self,
         policy: str | type[SACLagPolicy],
@@ -213,6 +215,9 @@ class SACLag(CostConstrainedAlgorithm, CheckedOffPolicyAlgorithm, SAC):
         super()._check_arguments()
         check_integer("target_update_interval", self.target_update_interval, low=1)
         check_integer("lagrange_start", self.lagrange_start, low=0)
+        initial_ent_coef(self.ent_coef)
+        if self.target_entropy != "auto":
+            check_range("target_entropy", self.target_entropy)
 
     def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
         """
@@ -275,6 +280,7 @@ class SACLag(CostConstrainedAlgorithm, CheckedOffPolicyAlgorithm, SAC):
             means = {"q_mean": q_values.mean(), "cost_q_mean": cost_q_values.mean(), "ent_coef": ent_coef.squeeze()}
             for name, value in (losses | means | {"actor_loss": actor_loss}).items():
                 stats[name].append(value.detach())
+        detach_distributions(self.policy)
 
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         self._record_multiplier()

@@ -4,6 +4,7 @@ import contextlib
 import functools
 import inspect
 import json
+import signal
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -12,13 +13,24 @@ from typing import Any
 
 from rl_zoo3.utils import ALGOS
 from stable_baselines3.common.callbacks import ProgressBarCallback
+from stable_baselines3.common.vec_env import SubprocVecEnv
 
 from sb3_chac.common.callbacks import PROGRESS_FILE, CSVProgress, GuidedProgressBar, SafetyCost
-from sb3_chac.common.checkpoints import ResumableCheckpoint, checkpoint_step
+from sb3_chac.common.checkpoints import (
+    DamagedCheckpoint,
+    ResumableCheckpoint,
+    StopSignals,
+    TrainingStopped,
+    checkpoint_step,
+    stored_rows,
+    verify,
+)
 from sb3_chac.common.guided import GuidedOffPolicyAlgorithm
 from sb3_chac.common.lagrange import CostConstrainedAlgorithm
 from sb3_chac.common.offline import OfflineAlgorithm
 from sb3_chac.envs import ENVIRONMENTS, ONE_PER_PROCESS, VALIDATION
+from sb3_chac.human.intervention import ExpertError, RuleError
+from sb3_chac.zoo.errors import check_file, check_hyperparameters, check_options, evaluating, one_line
 from sb3_chac.zoo.registration import ALGORITHMS, hyperparams_file
 
 # Steps between two checkpoints unless --save-freq says otherwise: what a person does at most for nothing
@@ -52,13 +64,28 @@ def init(original: Callable[..., None], manager: Any, *args: Any, **kwargs: Any)
     """
     arguments = inspect.signature(original).bind(*args, **kwargs).arguments
     algo = arguments["algo"]
-    if not arguments.get("config") and (algo in ALGORITHMS or arguments["env_id"] in ENVIRONMENTS):
+    if algo not in ALGORITHMS and arguments["env_id"] not in ENVIRONMENTS:
+        original(**arguments)
+        manager.steps_done = None
+        return
+    with one_line_of(manager, Exception):
+        check_options(arguments["args"])
+        init_ours(original, manager, algo, arguments)
+
+
+def init_ours(original: Callable[..., None], manager: Any, algo: str, arguments: dict[str, Any]) -> None:
+    """
+    :param arguments: of RL-Zoo3's ``__init__``
+    """
+    if not arguments.get("config"):
         with contextlib.suppress(FileNotFoundError):  # then RL-Zoo3 says itself that it has none either
             arguments["config"] = str(hyperparams_file(algo))
     if arguments["env_id"] in ONE_PER_PROCESS:
         arguments["vec_env_type"] = "subproc"
-    done = checkpoint_step(arguments.get("trained_agent", ""))
+    trained_agent = arguments.get("trained_agent", "")
+    done = checkpoint_step(trained_agent)
     if done is not None:
+        verify(Path(trained_agent).parent)
         arguments["seed"] = (arguments.get("seed", 0) + done) % 2**32
     original(**arguments)
     manager.steps_done = done
@@ -71,9 +98,40 @@ def is_ours(manager: Any) -> bool:
     return manager.algo in ALGORITHMS or manager.env_name.gym_id in ENVIRONMENTS
 
 
+def one_line_of(manager: Any, *kinds: type[Exception]) -> contextlib.AbstractContextManager[None]:
+    """
+    :return: see ``one_line``; nothing for those who tell errors themselves
+    """
+    return contextlib.nullcontext() if getattr(manager, "tells_errors", False) else one_line(*kinds)
+
+
+def setup_experiment(original: Callable[..., Any], manager: Any) -> Any:
+    """A mistake in the hyperparameters or the arguments of an environment ends in one line."""
+    if not is_ours(manager):
+        return original()
+    with one_line_of(manager, Exception):
+        check_file(manager.config, manager.env_name.gym_id)
+        return original()
+
+
+def create_envs(original: Callable[..., Any], manager: Any, *args: Any, **kwargs: Any) -> Any:
+    """Processes of environments leave signals to the one that trains: a terminal sends Ctrl-C to all of them."""
+    if not is_ours(manager) or manager.vec_env_class is not SubprocVecEnv:
+        return original(*args, **kwargs)
+    before = {number: signal.signal(number, signal.SIG_IGN) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        return original(*args, **kwargs)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
 def preprocess_hyperparams(original: Callable[..., Any], manager: Any, hyperparams: dict[str, Any]) -> Any:
     """Our environments are evaluated on maps that are neither those of the training nor those of the final test."""
-    processed = original(hyperparams)
+    if is_ours(manager):
+        check_hyperparameters(hyperparams, manager.n_timesteps)
+    with evaluating(hyperparams):
+        processed = original(hyperparams)
     env_id = manager.env_name.gym_id
     if manager._eval_env_kwargs_args is None and env_id in VALIDATION:
         manager.eval_env_kwargs = {**manager.env_kwargs, **VALIDATION[env_id]}
@@ -115,21 +173,60 @@ def save_config(original: Callable[..., None], manager: Any, saved_hyperparams: 
 
 
 def learn(original: Callable[..., None], manager: Any, model: Any) -> None:
-    """From a checkpoint on, only the steps that remain of the total are made, and counted on."""
-    if manager.steps_done is None:
+    """
+    From a checkpoint on, only the steps that remain of the total are made, and counted on. SIGTERM and Ctrl-C end the training
+    after a checkpoint, if it writes any.
+    """
+    if is_ours(manager):
+        with one_line_of(manager, OSError, ValueError, ExpertError, RuleError):
+            learn_ours(original, manager, model)
+    else:
+        original(model)
+
+
+def learn_ours(original: Callable[..., None], manager: Any, model: Any) -> None:
+    """
+    :param original: RL-Zoo3's ``learn``
+    """
+    if manager.steps_done is not None:
+        original = functools.partial(go_on, original, manager)
+    checkpoint = next((entry for entry in manager.callbacks if isinstance(entry, ResumableCheckpoint)), None)
+    if checkpoint is None:
         return original(model)
+    try:
+        with StopSignals() as checkpoint.signals:
+            original(model)
+    except TrainingStopped as stopped:
+        manager.save_trained_model(model)  # as RL-Zoo3 does after Ctrl-C
+        print(stopped, file=sys.stderr)
+        sys.exit(stopped.exit_code)
+    except OSError as error:  # such as a full disk
+        raise OSError(checkpoint.farewell(str(error))) from error
+
+
+def go_on(original: Callable[..., None], manager: Any, model: Any) -> None:
+    """
+    :param original: RL-Zoo3's ``learn``
+    :param model: of a checkpoint
+    :raises DamagedCheckpoint: if the replay buffer is not the one that belongs to it
+    """
+    rows = stored_rows(Path(manager.trained_agent).parent)
+    if rows is not None and model.replay_buffer.size() != rows:
+        raise DamagedCheckpoint(f"{manager.trained_agent}: {model.replay_buffer.size()} of {rows} stored steps were read.")
     remaining = max(manager.n_timesteps - model.num_timesteps, 0)
     print(f"Resuming at step {model.num_timesteps}, {remaining} of {manager.n_timesteps} steps remain. Seed: {manager.seed}")
 
-    def go_on(total_timesteps: int, **kwargs: Any) -> Any:
+    def learn_remaining(total_timesteps: int, **kwargs: Any) -> Any:
         return model.learn(remaining, reset_num_timesteps=False, **kwargs)
 
-    original(SimpleNamespace(learn=go_on, env=model.env))
+    original(SimpleNamespace(learn=learn_remaining, env=model.env))
 
 
 # Method of ExperimentManager -> what is called in its place, with the original
 AROUND: dict[str, Callable[..., Any]] = {
     "__init__": init,
+    "setup_experiment": setup_experiment,
+    "create_envs": create_envs,
     "_preprocess_hyperparams": preprocess_hyperparams,
     "create_callbacks": create_callbacks,
     "_save_config": save_config,

@@ -45,6 +45,7 @@ def register() -> None:
     add_environments(importlib.import_module("gymnasium.envs"))
     add_algorithms(importlib.import_module("rl_zoo3.utils"))
     add_experiments(importlib.import_module("rl_zoo3.exp_manager"))
+    add_training(importlib.import_module("rl_zoo3.train"))
 
 
 def add_environments(envs: ModuleType) -> None:
@@ -58,7 +59,11 @@ def add_algorithms(utils: ModuleType) -> None:
     """
     :param utils: ``rl_zoo3.utils``, whose ``ALGOS`` the rest of RL-Zoo3 shares by reference
     """
+    from sb3_chac.zoo.errors import store_dict
+
     utils.ALGOS.update({algo: getattr(sb3_chac, name) for algo, name in ALGORITHMS.items()})
+    if not hasattr(utils.StoreDict.__call__, "__wrapped__"):
+        utils.StoreDict.__call__ = store_dict(utils.StoreDict.__call__)
 
 
 def add_experiments(exp_manager: ModuleType) -> None:
@@ -71,3 +76,14 @@ def add_experiments(exp_manager: ModuleType) -> None:
     exp_manager.HYPERPARAMS_SAMPLER.update(HYPERPARAMS_SAMPLER)
     exp_manager.HYPERPARAMS_CONVERTER.update(HYPERPARAMS_CONVERTER)
     extend(exp_manager.ExperimentManager)
+
+
+def add_training(train: ModuleType) -> None:
+    """
+    :param train: ``rl_zoo3.train``, whose command ends in one line for what is wrong with its arguments
+    """
+    from sb3_chac.zoo.errors import one_line
+
+    command = train.train
+    if not hasattr(command, "__wrapped__"):
+        train.train = one_line(ValueError, AssertionError, ImportError, OSError)(command)  # type: ignore[attr-defined]

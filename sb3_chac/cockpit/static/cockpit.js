@@ -20,7 +20,7 @@ const pressed = new Set(); // buttons of the gamepad
 const sentAt = new Map(); // number of a ping -> time
 let role = "";
 let pings = 0;
-const socket = new WebSocket(`ws://${location.host}/ws${location.search}`);
+const socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/ws${location.search}`);
 socket.binaryType = "blob";
 
 // What the driver does

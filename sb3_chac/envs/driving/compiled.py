@@ -1,7 +1,7 @@
 """Compilation of loops over numbers and arrays, for what is computed in every step of an environment."""
 
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import numba
 
@@ -19,6 +19,6 @@ def compiled(function: Function) -> Function:
     :return: the same function, compiled; divisions by zero give inf or nan, as in numpy
     """
     try:
-        return numba.njit(function, cache=True, error_model="numpy")
+        return cast(Function, numba.njit(function, cache=True, error_model="numpy"))
     except RuntimeError:  # numba found no folder that it can write to
-        return numba.njit(function, error_model="numpy")
+        return cast(Function, numba.njit(function, error_model="numpy"))

@@ -6,14 +6,16 @@ from gymnasium import spaces
 from sb3_chac.envs.driving.compiled import compiled
 
 FAR = 40.0  # [m] farther hits count as none
-# Circular arcs from the ego's position, tangent to its heading
-CURVATURES = np.array([-0.2, -0.14, -0.09, -0.06, -0.04, -0.025, -0.012, 0, 0.012, 0.025, 0.04, 0.06, 0.09, 0.14, 0.2])  # [1/m]
+# [1/m] of circular arcs from the ego's position, tangent to its heading
+CURVATURES = np.array([-0.2, -0.14, -0.09, -0.06, -0.04, -0.025, -0.012, 0, 0.012, 0.025, 0.04, 0.06, 0.09, 0.14, 0.2])
 ARC_HALF_WIDTHS = np.array([1.2, 1.9])  # [m]
 # Strips along the route
 LATERALS = np.linspace(-3.0, 3.0, 9)  # [m] offsets of their middles from that of the route
 STRIP_HALF_WIDTHS = np.array([0.6, 1.2])  # [m]
 N_ARCS, N_STRIPS = len(ARC_HALF_WIDTHS) * len(CURVATURES), len(STRIP_HALF_WIDTHS) * len(LATERALS)
 N_CORRIDORS = N_ARCS + N_STRIPS
+N_VIEW = 2 * N_CORRIDORS  # what an observation holds of them
+FASTEST = 1.5  # [m] change of a free distance within a step that is told from greater ones
 STRIPS_BEGIN = 0.5  # [m] along the route, nearer hits are beside the ego
 ROUTE_SPACING = 1.0  # [m] between the points of a route
 
@@ -26,11 +28,12 @@ class Corridors:
 
     :param rays: number of lidar rays, in equal steps around the vehicle, ray 0 straight ahead
     :param reach: [m] of the rays
+    :param laterals: [m] offsets of the strips' middles from that of the route, shape (9,)
     """
 
-    def __init__(self, rays: int, reach: float) -> None:
+    def __init__(self, rays: int, reach: float, laterals: np.ndarray = LATERALS) -> None:
         angles = np.arange(rays) * 2 * np.pi / rays
-        self.reach = reach
+        self.reach, self.laterals = reach, laterals
         self.ahead = np.flatnonzero(np.cos(angles) > 1e-9)
         self.cos, self.sin = np.cos(angles[self.ahead]), np.sin(angles[self.ahead])
 
@@ -51,7 +54,7 @@ class Corridors:
             distances = (1.0 - closeness[hit]) * self.reach
             x, y = distances * self.cos[hit], distances * self.sin[hit]
             free[:N_ARCS] = _arcs(np.maximum(x, 1e-6), y).ravel()
-            free[N_ARCS:] = _strips(x, y, route, headings).ravel()
+            free[N_ARCS:] = _strips(x, y, route, headings, self.laterals).ravel()
         return 1.0 - np.minimum(free, FAR) / FAR
 
 
@@ -86,13 +89,14 @@ def _arcs(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 @compiled
-def _strips(x: np.ndarray, y: np.ndarray, route: np.ndarray, headings: np.ndarray) -> np.ndarray:
+def _strips(x: np.ndarray, y: np.ndarray, route: np.ndarray, headings: np.ndarray, laterals: np.ndarray) -> np.ndarray:
     """
     Project the hits on the nearest points of the route.
 
+    :param laterals: [m] offsets of the strips' middles from the route
     :return: [m] to the nearest hit along each strip, at least ``FAR`` if there is none, shape (widths, laterals)
     """
-    free = np.full((len(STRIP_HALF_WIDTHS), len(LATERALS)), FAR)
+    free = np.full((len(STRIP_HALF_WIDTHS), len(laterals)), FAR)
     half_squares = (route[:, 0] * route[:, 0] + route[:, 1] * route[:, 1]) / 2
     for hit in range(len(x)):
         nearest = np.argmax(x[hit] * route[:, 0] + y[hit] * route[:, 1] - half_squares)
@@ -101,10 +105,57 @@ def _strips(x: np.ndarray, y: np.ndarray, route: np.ndarray, headings: np.ndarra
         along, across = nearest * ROUTE_SPACING + dx * cos + dy * sin, dy * cos - dx * sin
         if along > STRIPS_BEGIN:
             for width in range(len(STRIP_HALF_WIDTHS)):
-                for strip in range(len(LATERALS)):
-                    if abs(across - LATERALS[strip]) < STRIP_HALF_WIDTHS[width]:
+                for strip in range(len(laterals)):
+                    if abs(across - laterals[strip]) < STRIP_HALF_WIDTHS[width]:
                         free[width, strip] = min(free[width, strip], along)
     return free
+
+
+@compiled
+def route_along(x: float, y: float, headings: np.ndarray) -> np.ndarray:
+    """
+    Integrate the headings of a route.
+
+    :param x: [m] of its first point, with ``y``
+    :param headings: [rad] at its points, which are ``ROUTE_SPACING`` apart, shape (n,)
+    :return: [m] its points, shape (n, 2)
+    """
+    cos, sin = np.cos(headings), np.sin(headings)
+    route = np.empty((len(headings), 2))
+    route[0, 0], route[0, 1] = x, y
+    for i in range(1, len(headings)):
+        route[i, 0] = route[i - 1, 0] + (cos[i] + cos[i - 1]) * (ROUTE_SPACING / 2)
+        route[i, 1] = route[i - 1, 1] + (sin[i] + sin[i - 1]) * (ROUTE_SPACING / 2)
+    return route
+
+
+class CorridorView:
+    """
+    Corridors, and how their free distances changed since the observation before: what stands comes nearer as fast as the ego
+    drives, what drives along does not. Without the change a policy takes a lane for blocked in which all go on at its speed,
+    stays in the other one, and runs into what stands there.
+
+    The parameters are those of ``Corridors``.
+    """
+
+    def __init__(self, rays: int, reach: float, laterals: np.ndarray = LATERALS) -> None:
+        self.corridors = Corridors(rays, reach, laterals)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the observation before."""
+        self.last: np.ndarray | None = None
+
+    def __call__(self, closeness: np.ndarray, route: np.ndarray, headings: np.ndarray) -> np.ndarray:
+        """
+        Look at the next observation. The parameters are those of ``Corridors``.
+
+        :return: all corridors, then the change of each free distance in units of ``FASTEST``, within [-1, 1], negative where
+            something comes nearer, 0 in a first observation; shape (N_VIEW,)
+        """
+        here = self.corridors(closeness, route, headings)
+        last, self.last = here if self.last is None else self.last, here
+        return np.concatenate([here, np.clip((last - here) * (FAR / FASTEST), -1.0, 1.0)])
 
 
 def corridors_remedy(trained_on: spaces.Space | None, given: spaces.Space | None) -> str:
@@ -116,10 +167,10 @@ def corridors_remedy(trained_on: spaces.Space | None, given: spaces.Space | None
     :return: a sentence, with a blank before it; empty if something else is the matter
     """
     sizes = [space.shape[0] if isinstance(space, spaces.Box) and len(space.shape) == 1 else 0 for space in (trained_on, given)]
-    if abs(sizes[0] - sizes[1]) != N_CORRIDORS:
+    if abs(sizes[0] - sizes[1]) != N_VIEW:
         return ""
     flag = sizes[0] > sizes[1]
     return (
-        f" The {sizes[0]} numbers are {'with' if flag else 'without'} corridors, the {sizes[1]} {'without' if flag else 'with'} "
-        f"them: make the environment with corridors={flag} (on the command line: --env-kwargs corridors:{flag})."
+        f" {max(sizes)} numbers are with corridors, {min(sizes)} without: make the environment with corridors={flag} (on the "
+        f"command line: --env-kwargs corridors:{flag})."
     )

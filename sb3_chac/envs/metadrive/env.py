@@ -1,17 +1,22 @@
 """MetaDriveSafety-v0: the simulator of the paper's experiments behind the interface of SafeDrive."""
 
+import math
 from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from sb3_chac.common.checks import check_integer, check_range
+from sb3_chac.common.arguments import checked
+from sb3_chac.common.checks import check_driving_action, check_integer, check_range
+from sb3_chac.common.contract import TakeoverDisplay
 from sb3_chac.envs.display import STEPS_PER_SECOND
+from sb3_chac.envs.driving.corridors import FAR, LATERALS, N_CORRIDORS, N_VIEW, ROUTE_SPACING, CorridorView, route_along
 from sb3_chac.envs.metadrive.drivers import DRIVERS
 from sb3_chac.envs.metadrive.simulator import check_installed, is_headless, make_simulator, prepare, release
 
-N_OBSERVATION = 259
+N_EGO, N_CHECKPOINT, N_LIDAR = 9, 5, 240  # of the ego, of each of two checkpoints, rays
+N_OBSERVATION = N_EGO + 2 * N_CHECKPOINT + N_LIDAR
 MAX_SCENARIO = 1_000_000
 CONTACT_MEMORY = 10  # steps without contact after which touching the same object is a new collision
 # MetaDrive's, which are lost if any of them is changed
@@ -23,10 +28,15 @@ SPAWN = {
 # (benchmarks/metadrive_safety.py observations). The fifth, the steering, hardly moves in MetaDrive 0.4.3: it is left small
 MEANS = [0.3, 0.3, 0.5, 0.75, 0.5, 0.5, 0.64, 0.28, 0.5, 0.71, 0.49, 0.17, 0.5, 0.6, 0.87, 0.49, 0.12, 0.48, 0.58]
 STDS = [0.15, 0.17, 0.1, 0.2, 0.1, 0.12, 0.16, 0.2, 0.17, 0.15, 0.1, 0.28, 0.29, 0.15, 0.12, 0.2, 0.23, 0.26, 0.13]
-N_LIDAR = N_OBSERVATION - len(MEANS)
 # (MetaDrive's - OFFSET) * SCALE is what the agent sees; rays become closeness
 OFFSET = np.array([*MEANS, *[1.0] * N_LIDAR], dtype=np.float32)
 SCALE = np.array([*[1 / std for std in STDS], *[-1.0] * N_LIDAR], dtype=np.float32)
+# In MetaDrive's units
+LIDAR_REACH, CHECKPOINT_REACH = 50.0, 50.0  # [m]
+WIDEST_ROAD, LANE_WIDTH = 18.0, 3.5  # [m]
+WIDEST_BEND, LONGEST_BEND = 60.0, math.radians(135.0)  # [m] radius, to which the width of the road is added, and [rad]
+STRIPS = LATERALS * (4.0 / 3.0)  # [m]: three lanes of 3.5 m less the width of a car
+ROUTE = np.arange(0.0, FAR + ROUTE_SPACING / 2, ROUTE_SPACING)  # [m] where the route is rebuilt
 FULL_BRAKE = 1.5  # [m/s] that braking with all its might takes off the speed in a step, at least
 
 
@@ -45,17 +55,41 @@ PRESETS = {
 }
 
 
-class MetaDriveSafetyEnv(gym.Env):
+class MetaDriveSafetyEnv(gym.Env, TakeoverDisplay):
     """
     MetaDrive's SafeMetaDriveEnv: drive through seeded maps of three blocks among traffic, cones, warning triangles, barriers
     and broken-down vehicles; ten decisions per second. One environment per process (see ``EngineInUse``).
 
     **Actions**, shape (2,), in [-1, 1]: steering (1 is 40 degrees of the front wheels to the left) and throttle or brake.
 
-    **Observations**, shape (259,): MetaDrive's, scaled: 9 of the ego (distances to the left and the right edge, heading,
-    speed, steering, last action, yaw rate, offset in the lane) and 10 of the next two checkpoints, all with a mean near 0 and
-    a standard deviation near 1, and 240 lidar rays as closeness (0 is free up to 50 m, 1 touching). With
-    ``raw_observations`` they stay in [0, 1], rays as distances (1 is free), from which learning is far slower.
+    **Observations**, shape (355,): MetaDrive's 259 numbers, each as (MetaDrive's - mean) / standard deviation (``MEANS``,
+    ``STDS``: about -1 to 1), rays as closeness, then the corridors. Of MetaDrive's, all in [0, 1]:
+
+    ======= ==============================================================================================
+    0, 1    distance to the left and to the right edge of the road, d / 18 m
+    2       heading against the road's, to the right, (1 + sin(angle)) / 2
+    3       speed, (v + 1 km/h) / (v_max + 1 km/h)
+    4       steering; hardly moves, (action / 60 + 1) / 2
+    5, 6    last action, (a + 1) / 2
+    7       size of the yaw rate, per rad/s, 1 at most
+    8       offset from the middle of the lane, to the right, (d / 2.25 m + 1) / 2
+    9-13    checkpoint at the end of the road: how far ahead and to the left, each (d / 50 m + 1) / 2, at most 50 m away;
+            radius of the road's leftmost lane, r / (60 m + width of the road), 0 if it is straight; way it bends, 0 left,
+            0.5 straight, 1 right; angle by which it bends, (angle / 135 degrees + 1) / 2
+    14-18   checkpoint at the end of the next road, alike; the same once more on the last road
+    19-258  240 lidar rays, anticlockwise from straight ahead, as closeness: 0 free up to 50 m, 1 touching
+    259-306 corridors, computed from the numbers above: closeness of the nearest ray's hit, 1 - d / 40 m, 0 if there is none
+    307-354 change of the free distance of each of these 48 since the observation before, d / 1.5 m, negative where
+            something comes nearer
+    ======= ==============================================================================================
+
+    Corridors 259-273 are along circular arcs of the curvatures -0.2 to 0.2 per metre, positive to the left (``CURVATURES`` of
+    ``envs.driving.corridors``), 1.2 m to either side, and 274-288 the same, 1.9 m; 289-297 are along the route, in strips 4,
+    3, 2, 1 m to the right of the middle of the road, on it, and as much to its left, 0.6 m to either side, and 298-306 the
+    same, 1.2 m. The route is rebuilt from numbers 0 to 2 and 9 to 18 (``route_ahead``) and straight beyond them.
+
+    With ``raw_observations`` they are MetaDrive's 259 as they are, rays as distances (1 is free), from which learning is far
+    slower.
 
     **Reward**: MetaDrive's: metres along the lane + 0.1 v / v_max, but on a step in contact with something -5 in its place, on
     arrival +10, off the road or the route -5.
@@ -63,7 +97,9 @@ class MetaDriveSafetyEnv(gym.Env):
     **Cost** (``info["cost"]``): 1 per collision, counted when a contact begins. ``info["contact_cost"]`` is MetaDrive's own: 1
     on each step in contact with something, and for leaving the road.
 
-    **Ends** (terminated): at the destination, off the road or off the route. Truncated after ``horizon`` steps.
+    **Ends** (terminated): at the destination, off the road or off the route. Truncated after ``horizon`` steps, and when a
+    contact has lasted for ``contact_limit`` steps: the ego cannot reverse and others do not make way, so that it may press
+    against a vehicle to the horizon, at -5 a step. Neither MetaDrive nor the published protocols end that (None).
 
     **Info**: as SafeDrive's (``cost``, ``collision``, ``contact``, ``out_of_road``, ``arrive_dest``, ``is_success``,
     ``route_completion``, ``speed`` [m/s], ``episode_cost``, ``scenario``), and ``contact_cost``.
@@ -80,7 +116,10 @@ class MetaDriveSafetyEnv(gym.Env):
     :param traffic_density: vehicles per 10 m of lane
     :param max_speed: [km/h] of the ego
     :param horizon: [steps of 0.1 s] after which an episode is truncated
-    :param raw_observations: give MetaDrive's own observations
+    :param contact_limit: [steps of 0.1 s] that a contact may last until the episode is truncated, None for ever; shorter
+        breaks than 10 steps do not interrupt it
+    :param raw_observations: give MetaDrive's own 259 numbers as they are, without corridors
+    :param corridors: whether the observation ends with the corridors
     :param headless: go without MetaDrive's assets, None to let the environment variable SB3_CHAC_METADRIVE_HEADLESS decide
     :param render_mode: "rgb_array", "human" or None: seen from above
     :raises ValueError: for an argument out of its range
@@ -91,6 +130,7 @@ class MetaDriveSafetyEnv(gym.Env):
 
     metadata = {"render_modes": ["rgb_array", "human"], "render_fps": STEPS_PER_SECOND}  # noqa: RUF012
 
+    @checked
     def __init__(
         self,
         preset: str = "chac",
@@ -99,7 +139,9 @@ class MetaDriveSafetyEnv(gym.Env):
         traffic_density: float | None = None,
         max_speed: float | None = None,
         horizon: int | None = None,
+        contact_limit: int | None = 100,
         raw_observations: bool = False,
+        corridors: bool = True,
         headless: bool | None = None,
         render_mode: str | None = None,
     ) -> None:
@@ -115,18 +157,25 @@ class MetaDriveSafetyEnv(gym.Env):
         check_range("traffic_density", settings.traffic_density, low=0.0, high=1.0)
         check_range("max_speed", settings.max_speed, low=1.0, high=200.0)
         check_integer("horizon", settings.horizon, low=1)
+        if contact_limit is not None:
+            check_integer("contact_limit", contact_limit, low=1)
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise ValueError(f"render_mode must be None or one of {self.metadata['render_modes']}, got {render_mode!r}.")
         check_installed()
         prepare(is_headless(headless))
         self.start_scenario, self.num_scenarios = int(start_scenario), int(settings.num_scenarios)
-        self.horizon = int(settings.horizon)
+        self.horizon, self.contact_limit = int(settings.horizon), contact_limit
         self.render_mode = render_mode
         self.hud: dict[str, Any] = {}  # what wrappers want to have shown beside the speed
         self.action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
         self.raw_observations = bool(raw_observations)
-        bounds = self._observed(np.zeros(N_OBSERVATION)), self._observed(np.ones(N_OBSERVATION))
-        self.observation_space = spaces.Box(np.minimum(*bounds), np.maximum(*bounds), dtype=np.float32)
+        self._corridors = CorridorView(N_LIDAR, LIDAR_REACH, STRIPS) if corridors and not raw_observations else None
+        bounds = self._scaled(np.zeros(N_OBSERVATION)), self._scaled(np.ones(N_OBSERVATION))
+        low, high = np.minimum(*bounds), np.maximum(*bounds)
+        if self._corridors is not None:
+            low = np.concatenate([low, np.zeros(N_CORRIDORS), -np.ones(N_VIEW - N_CORRIDORS)])
+            high = np.concatenate([high, np.ones(N_VIEW)])
+        self.observation_space = spaces.Box(low.astype(np.float32), high.astype(np.float32))
         self._viewer: Any = None
         self.simulator = make_simulator(
             self,
@@ -138,6 +187,7 @@ class MetaDriveSafetyEnv(gym.Env):
                 accident_prob=0.8,
                 out_of_route_done=True,
                 horizon=self.horizon,
+                force_destroy=True,  # vehicles that are used again keep something, and episodes would depend on those before
                 agent_configs={"default_agent": {**SPAWN, "max_speed_km_h": float(settings.max_speed)}},
             ),
         )
@@ -157,21 +207,26 @@ class MetaDriveSafetyEnv(gym.Env):
         observation, info = self.simulator.reset(seed=self.scenario)
         self.steps, self.episode_cost, self.collisions = 0, 0, 0
         self._touched: dict[Any, int] = {}  # object -> step of the last contact
+        self._contact_began: int | None = None  # the step, of a contact that lasts
         info = self._info(info)
+        if self._corridors is not None:
+            self._corridors.reset()
         if self.render_mode == "human":
             self.render()
         return self._observed(observation), info
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        check_driving_action(action)
         steering, throttle = np.clip(np.asarray(action, dtype=float), -1.0, 1.0)
         throttle = max(throttle, -max(self.forward_speed, 0.0) / FULL_BRAKE)
         observation, reward, terminated, truncated, info = self.simulator.step([steering, throttle])
         self.steps += 1
         self._count_collisions(info)
+        truncated = bool(truncated) or (not terminated and self._contact_lasts_too_long())
         info = self._info(info)
         if self.render_mode == "human":
             self.render()
-        return self._observed(observation), float(reward), bool(terminated), bool(truncated), info
+        return self._observed(observation), float(reward), bool(terminated), truncated, info
 
     def _count_collisions(self, info: dict[str, Any]) -> None:
         """
@@ -184,6 +239,15 @@ class MetaDriveSafetyEnv(gym.Env):
             self.collisions += self.steps - self._touched.get(name, -CONTACT_MEMORY) >= CONTACT_MEMORY
             self._touched[name] = self.steps
         self.episode_cost += self.collisions
+
+    def _contact_lasts_too_long(self) -> bool:
+        last = max(self._touched.values(), default=-CONTACT_MEMORY)
+        if self.steps - last >= CONTACT_MEMORY:
+            self._contact_began = None
+        elif self._contact_began is None:
+            self._contact_began = self.steps
+        limit, began = self.contact_limit, self._contact_began
+        return limit is not None and began is not None and last - began + 1 >= limit
 
     def _touching(self, vehicles: bool, objects: bool) -> set[str]:
         """
@@ -236,6 +300,13 @@ class MetaDriveSafetyEnv(gym.Env):
         return dict(self.last_info)
 
     def _observed(self, observation: np.ndarray) -> np.ndarray:
+        scaled = self._scaled(observation)
+        if self._corridors is None:
+            return scaled
+        corridors = self._corridors(scaled[-N_LIDAR:], *route_ahead(scaled))
+        return np.concatenate([scaled, corridors], dtype=np.float32)
+
+    def _scaled(self, observation: np.ndarray) -> np.ndarray:
         clipped = np.clip(observation, 0.0, 1.0, dtype=np.float32)
         return clipped if self.raw_observations else (clipped - OFFSET) * SCALE
 
@@ -299,3 +370,57 @@ class MetaDriveSafetyEnv(gym.Env):
             self._viewer.close()
             self._viewer = None
         release(self)
+
+
+def route_ahead(observation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """
+    Rebuild the middle of the route from a scaled observation: two roads, each straight or an arc, and straight on.
+
+    Width, offset and heading of the first road are observed at the ego, its end is the first checkpoint; the second road
+    goes on from there to the second one. How they bend is observed, too.
+
+    :param observation: shape (259,) or longer
+    :return: [m] points every metre from beside the ego to 40 m ahead, in the ego's frame, x ahead and y to the left, shape
+        (41, 2), and [rad] the route's headings there, shape (41,)
+    """
+    values = (observation[: len(MEANS)] / SCALE[: len(MEANS)] + OFFSET[: len(MEANS)]).astype(float).tolist()
+    left, right = values[0] * WIDEST_ROAD, values[1] * WIDEST_ROAD
+    lateral, width = (left - right) / 2, left + right
+    (x, y), curvature, _ = _road(values[N_EGO : N_EGO + N_CHECKPOINT], width)
+    (next_x, next_y), next_curvature, angle = _road(values[N_EGO + N_CHECKPOINT :], width)
+    distance = math.hypot(x, y)
+    seen = distance < CHECKPOINT_REACH - 0.01
+    heading = math.asin(min(max(2 * values[2] - 1, -1.0), 1.0))
+    if not curvature and x > 5.0:  # the observed heading is against the rightmost lane, which leaves the road at a ramp
+        far = math.atan2(y, x)
+        near = far - math.asin(min(max(lateral / distance, -1.0), 1.0))
+        heading = near if seen else min(max(heading, min(near, far)), max(near, far))
+    cos, sin = math.cos(heading), math.sin(heading)
+    start = -sin * lateral, cos * lateral
+    along, across = (x - start[0]) * cos + (y - start[1]) * sin, (y - start[1]) * cos - (x - start[0]) * sin
+    if curvature and seen:
+        length = math.atan2(along * abs(curvature), 1 - across * curvature) / abs(curvature)
+    else:
+        length = along if seen else FAR
+    next_length = math.hypot(next_x - x, next_y - y)  # 0 on the last road, which is both roads
+    if next_length > 0.01 and next_curvature:
+        next_length = angle / abs(next_curvature)
+    elif math.hypot(next_x, next_y) > CHECKPOINT_REACH - 0.01:
+        next_length = FAR
+    headings = heading + curvature * np.minimum(ROUTE, length) + next_curvature * np.clip(ROUTE - length, 0.0, next_length)
+    return route_along(*start, headings), headings
+
+
+def _road(values: list[float], width: float) -> tuple[tuple[float, float], float, float]:
+    """
+    :param values: of a checkpoint, as MetaDrive gives them, each in [0, 1]
+    :param width: [m] of the road
+    :return: position [m] of the checkpoint, curvature [1/m] of the middle of the road that ends there, positive to the left,
+        0 if it is straight, and angle [rad] by which it bends
+    """
+    position = (2 * values[0] - 1) * CHECKPOINT_REACH, (2 * values[1] - 1) * CHECKPOINT_REACH
+    radius = values[2] * (WIDEST_BEND + width)  # of the leftmost lane
+    if radius < 0.5:
+        return position, 0.0, 0.0
+    turn = 1.0 if values[3] < 0.5 else -1.0
+    return position, turn / (radius + turn * (width - LANE_WIDTH) / 2), (2 * values[4] - 1) * LONGEST_BEND

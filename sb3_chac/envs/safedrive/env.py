@@ -9,10 +9,12 @@ import numpy as np
 from gymnasium import spaces
 from highway_env.road.road import Road
 
-from sb3_chac.common.checks import check_integer, check_range
+from sb3_chac.common.arguments import checked
+from sb3_chac.common.checks import check_driving_action, check_integer, check_range
+from sb3_chac.common.contract import TakeoverDisplay
 from sb3_chac.envs.display import STEPS_PER_SECOND
 from sb3_chac.envs.driving.compiled import compiled
-from sb3_chac.envs.driving.corridors import N_CORRIDORS, Corridors
+from sb3_chac.envs.driving.corridors import N_VIEW, CorridorView
 from sb3_chac.envs.safedrive.driver import IMPERFECTIONS, ScriptedDriver
 from sb3_chac.envs.safedrive.geometry import Pose, boxes_overlap
 from sb3_chac.envs.safedrive.lidar import Lidar
@@ -39,7 +41,7 @@ class Scene(NamedTuple):
     obstacle_sizes: np.ndarray  # length and width
 
 
-class SafeDriveEnv(gym.Env):
+class SafeDriveEnv(gym.Env, TakeoverDisplay):
     """
     Drive a route through seeded maps of straights, curves, ramps, roundabouts, T-intersections and intersections, among
     traffic, cones, warning triangles and parked vehicles; ten decisions per second.
@@ -47,7 +49,7 @@ class SafeDriveEnv(gym.Env):
     **Actions**, shape (2,), in [-1, 1]: steering (1 is 0.6 rad of the front wheels to the right) and acceleration (1 is
     4 m/s2, -1 brakes as much; the vehicle does not drive backwards; top speed 15 m/s).
 
-    **Observations**, shape (307,), in [-1, 1]; t(x) stands for tanh(x):
+    **Observations**, shape (355,), in [-1, 1]; t(x) stands for tanh(x):
 
     ======= ==============================================================================================
     0       distance to the left edge of the carriageway, d / 4 m - 1
@@ -66,10 +68,13 @@ class SafeDriveEnv(gym.Env):
             within 1.9 m of them
     289-306 closeness, alike, in 9 strips along the route, -3, -2.25, ..., 3 m to the right of its middle: within 0.6 m,
             then within 1.2 m
+    307-354 change of the free distance of each of these 48 since the observation before, d / 1.5 m, negative where
+            something comes nearer
     ======= ==============================================================================================
 
-    The last 48, the corridors, are computed from the others (``sb3_chac.envs.driving.corridors``): which way is free, as an
-    MLP hardly finds out from rays. ``corridors=False`` leaves them out.
+    The last 96, the corridors, are computed from the others and from those of the observation before
+    (``sb3_chac.envs.driving.corridors``): which way is free, and who drives along, as an MLP hardly finds out from rays.
+    ``corridors=False`` leaves them out.
 
     **Reward**: ``displacement_reward`` per metre of progress along the route, ``speed_reward`` v / v_max per step, less
     ``collision_penalty`` per collision, ``arrival_reward`` at the destination, less ``out_of_road_penalty`` off the
@@ -108,6 +113,7 @@ class SafeDriveEnv(gym.Env):
 
     metadata = {"render_modes": ["rgb_array", "human"], "render_fps": STEPS_PER_SECOND}  # noqa: RUF012
 
+    @checked
     def __init__(
         self,
         start_scenario: int = 100,
@@ -159,9 +165,9 @@ class SafeDriveEnv(gym.Env):
 
         self.action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
         self.lidar = Lidar()
-        self._corridors = Corridors(self.lidar.rays, self.lidar.reach) if corridors else None
-        n_observation = N_STATE + self.lidar.rays + N_CORRIDORS * corridors
-        self.observation_space = spaces.Box(-1.0, 1.0, (n_observation,), np.float32)
+        self._corridors = CorridorView(self.lidar.rays, self.lidar.reach) if corridors else None
+        self._n_observation = N_STATE + self.lidar.rays + N_VIEW * corridors
+        self.observation_space = spaces.Box(-1.0, 1.0, (self._n_observation,), np.float32)
         self._scenes: OrderedDict[int, Scene] = OrderedDict()
         self._viewer: Any = None
 
@@ -208,6 +214,8 @@ class SafeDriveEnv(gym.Env):
         self._touched: dict[tuple[str, int], int] = {}  # object -> step of the last contact
         self._tow: dict[int, int] = {}  # parked vehicle that was hit -> step at which it is gone
         self._find_boxes()
+        if self._corridors is not None:
+            self._corridors.reset()
         if self.render_mode == "human":
             self.render()
         return self._observe(), self._info()
@@ -216,6 +224,7 @@ class SafeDriveEnv(gym.Env):
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         ego = self.ego
+        check_driving_action(action)
         action = np.minimum(np.maximum(np.asarray(action, dtype=float), -1.0), 1.0)
         before = Pose(ego.position[0], ego.position[1], ego.heading)
         ego.control(action[0], action[1])
@@ -301,7 +310,7 @@ class SafeDriveEnv(gym.Env):
     def _observe(self) -> np.ndarray:
         ego = self.ego
         distances, self.seen = self.scan()
-        observation = np.empty(self.observation_space.shape, np.float32)
+        observation = np.empty(self._n_observation, np.float32)
         off_lane = self.lateral - LANES[int(self.lateral > 0)]
         to_edge = min(max(self.lateral / HALF_WIDTH, -1.0), 1.0)
         observation[:N_EGO] = (

@@ -3,7 +3,7 @@
 import numpy as np
 
 from sb3_chac.envs.driving.compiled import compiled
-from sb3_chac.envs.driving.corridors import ROUTE_SPACING
+from sb3_chac.envs.driving.corridors import ROUTE_SPACING, route_along
 from sb3_chac.envs.safedrive.geometry import SPACING
 from sb3_chac.envs.safedrive.map import HALF_WIDTH
 
@@ -60,22 +60,6 @@ def route_ahead(observation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         route's headings there, shape (51,)
     """
     tanhs = np.minimum(np.maximum(observation[ROUTE_HEADINGS], -0.999999), 0.999999)
-    headings_there = np.arctanh(tanhs) * ROUTE_HEADING_SCALES
-    return _integrate(headings_there.astype(float), float(observation[0] * HALF_WIDTH))
-
-
-@compiled
-def _integrate(headings_there: np.ndarray, lateral: float) -> tuple[np.ndarray, np.ndarray]:
-    """
-    :param headings_there: [rad] of the route beside the ego and at the checkpoints
-    :param lateral: [m] of the ego, to the right of the route
-    :return: as ``route_ahead``
-    """
-    headings = np.interp(ROUTE, ROUTE_KNOTS, headings_there)
-    cos, sin = np.cos(headings), np.sin(headings)
-    route = np.empty((len(ROUTE), 2))
-    route[0, 0], route[0, 1] = sin[0] * lateral, -cos[0] * lateral
-    for i in range(1, len(ROUTE)):
-        route[i, 0] = route[i - 1, 0] + (cos[i] + cos[i - 1]) * (ROUTE_SPACING / 2)
-        route[i, 1] = route[i - 1, 1] + (sin[i] + sin[i - 1]) * (ROUTE_SPACING / 2)
-    return route, headings
+    headings = np.interp(ROUTE, ROUTE_KNOTS, np.arctanh(tanhs) * ROUTE_HEADING_SCALES)
+    lateral = float(observation[0] * HALF_WIDTH)
+    return route_along(np.sin(headings[0]) * lateral, -np.cos(headings[0]) * lateral, headings), headings

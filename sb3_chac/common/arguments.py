@@ -1,0 +1,192 @@
+"""Arguments of constructors, checked by what their signatures say of them, before anything is built."""
+
+import collections.abc
+import functools
+import inspect
+import math
+import numbers
+import os
+import types
+import typing
+from collections.abc import Callable
+from typing import Any, NamedTuple, TypeVar
+
+import gymnasium as gym
+import numpy as np
+import torch as th
+from stable_baselines3.common.vec_env import VecEnv
+
+Init = TypeVar("Init", bound=Callable[..., None])
+
+
+class Range(NamedTuple):
+    """Numbers from ``low`` (with ``exclusive``: above it) to ``high``."""
+
+    low: float
+    high: float = math.inf
+    exclusive: bool = False
+
+    def __contains__(self, value: Any) -> bool:
+        return self.low <= value <= self.high and not (self.exclusive and value == self.low)
+
+    def __str__(self) -> str:
+        limit = f"{'above' if self.exclusive else 'of at least'} {self.low:g}"
+        return limit + (f" and at most {self.high:g}" if math.isfinite(self.high) else "")
+
+
+# Of SB3's arguments that SB3 takes as they come. Each class checks its own
+RANGES = {
+    "n_steps": Range(1),
+    "n_epochs": Range(1),
+    "batch_size": Range(1),
+    "gamma": Range(0, 1),
+    "gae_lambda": Range(0, 1),
+    "clip_range": Range(0, exclusive=True),
+    "clip_range_vf": Range(0, exclusive=True),
+    "ent_coef": Range(0),
+    "vf_coef": Range(0),
+    "max_grad_norm": Range(0, exclusive=True),
+    "target_kl": Range(0, exclusive=True),
+    "train_freq": Range(1),
+    "stats_window_size": Range(1),
+    "verbose": Range(0),
+    "seed": Range(0, 2**32 - 1),
+    "n_envs": Range(1),
+}
+
+
+SCHEDULES = ("clip_range", "clip_range_vf")  # that nobody else checks; they may end at 0
+
+
+def checked(init: Init) -> Init:
+    """
+    :param init: ``__init__`` of a class. What does not fit the annotation of an argument, or is NaN or infinite, raises a
+        ``ValueError`` that begins with its name. Models that are being loaded get their arguments later and are left alone
+    """
+    signature = inspect.signature(init)
+    hints: dict[str, Any] = {}
+
+    @functools.wraps(init)
+    def call(self: Any, *args: Any, **kwargs: Any) -> None:
+        if kwargs.get("_init_setup_model", True):
+            if not hints:  # now, as they may name what is defined after the class
+                hints.update(annotations(init))
+            for name, value in signature.bind(self, *args, **kwargs).arguments.items():
+                if name in hints:
+                    check_argument(name, value, hints[name])
+                    check_name(type(self), name, value)
+        init(self, *args, **kwargs)
+
+    return typing.cast(Init, call)
+
+
+def annotations(init: Callable[..., None]) -> dict[str, Any]:
+    """
+    :return: those of the arguments, by name
+    """
+    # SB3's GymEnv names the first, a Dataset of demonstrations the others, which say themselves what is wrong with one
+    return typing.get_type_hints(init, localns={"VecEnv": VecEnv, "Demonstrations": Any, "MinariDataset": Any})
+
+
+def check_argument(name: str, value: Any, hint: Any) -> None:
+    """
+    :param name: of the argument
+    :param value: that it has
+    :param hint: its annotation
+    :raises ValueError: unless they fit, and numbers are finite and within ``RANGES``
+    """
+    if not fits(value, hint):
+        raise ValueError(f"{name} must be {describe(hint)}, got {value!r}.")
+    limits = RANGES.get(name)
+    for number in numbers_in(value):
+        if limits is not None and number not in limits:
+            raise ValueError(f"{name} must be a number {limits}, got {value!r}.")
+    if name in SCHEDULES and callable(value):
+        start, end = float(value(1.0)), float(value(0.0))
+        if start not in RANGES[name] or not 0 <= end < math.inf:
+            raise ValueError(f"{name} must be a schedule of numbers {RANGES[name]}, got one from {start} to {end}.")
+    if name == "sde_sample_freq" and value != -1 and value < 1:
+        raise ValueError(f"sde_sample_freq must be an integer of at least 1, or -1 (once a rollout), got {value!r}.")
+    if name == "train_freq" and isinstance(value, tuple) and value[1] not in ("step", "episode"):
+        raise ValueError(f"train_freq must count in 'step' or 'episode', got {value!r}.")
+
+
+def check_name(owner: type, name: str, value: Any) -> None:
+    """
+    :param owner: class whose argument it is
+    :raises ValueError: for a policy, an environment or a device that does not exist
+    """
+    if not isinstance(value, str):
+        return
+    if name == "policy" and value not in (aliases := getattr(owner, "policy_aliases", {value: None})):
+        raise ValueError(f"policy must be one of {', '.join(aliases)}, or a class of policies, got {value!r}.")
+    known = {*gym.registry, *(entry.rpartition("-v")[0] for entry in gym.registry)}  # gymnasium finds the version by itself
+    if name == "env" and ":" not in value and value not in known:
+        raise ValueError(f"env must be an environment or the id of one that gymnasium knows, got {value!r}.")
+    if name == "device" and value != "auto":
+        try:
+            th.device(value)
+        except RuntimeError as error:
+            raise ValueError(f"device must be 'auto', 'cpu', 'cuda' or another of PyTorch's, got {value!r}.") from error
+
+
+def numbers_in(value: Any) -> list[float]:
+    """
+    :return: a number itself, the first of a train_freq; none of anything else
+    """
+    if isinstance(value, tuple) and value:
+        value = value[0]
+    return [value] if isinstance(value, numbers.Real) and not isinstance(value, bool | np.bool_) else []  # type: ignore[list-item]
+
+
+def fits(value: Any, hint: Any) -> bool:
+    """
+    :param hint: an annotation; what is none of the kinds below fits anything
+    """
+    origin, parts = typing.get_origin(hint), typing.get_args(hint)
+    if hint is Any or isinstance(hint, TypeVar):
+        return True
+    if origin in (typing.Union, types.UnionType):
+        return any(fits(value, part) for part in parts)
+    if hint is type(None) or hint is None:
+        return value is None
+    if hint is bool:
+        return isinstance(value, bool | np.bool_)
+    if hint is int:
+        return isinstance(value, numbers.Integral) and not isinstance(value, bool)
+    if hint is float:
+        return isinstance(value, numbers.Real) and not isinstance(value, bool) and math.isfinite(value)
+    if hint is str:
+        return isinstance(value, str | os.PathLike)
+    if origin is tuple:
+        return isinstance(value, tuple) and len(value) == len(parts) and all(map(fits, value, parts))
+    if origin is type:
+        return isinstance(value, type)
+    if origin is collections.abc.Callable:
+        return callable(value)
+    kind = origin or hint
+    if not isinstance(kind, type) or getattr(kind, "_is_protocol", False):
+        return True
+    return isinstance(value, kind)
+
+
+WORDS = {int: "an integer", float: "a finite number", bool: "True or False", str: "text", dict: "a dict", type(None): "None"}
+
+
+def describe(hint: Any) -> str:
+    """
+    :param hint: an annotation
+    :return: what it asks for, to read
+    """
+    origin, parts = typing.get_origin(hint), typing.get_args(hint)
+    if origin in (typing.Union, types.UnionType):
+        return " or ".join(dict.fromkeys(map(describe, parts)))
+    if hint in WORDS:
+        return WORDS[hint]
+    if origin is type:
+        return "a class"
+    if origin is tuple:
+        return f"a tuple ({', '.join(map(describe, parts))})"
+    if origin is collections.abc.Callable:
+        return "a function"
+    return f"a {getattr(origin or hint, '__name__', hint)}"

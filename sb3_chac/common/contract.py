@@ -1,0 +1,227 @@
+"""
+The contract between environment, wrapper, data and algorithm about takeovers: which entry of ``info`` says that the human
+acted, which one holds the action and in which units, and how algorithms talk to the wrapper in which the human is asked.
+"""
+
+from collections.abc import Sequence
+from enum import Enum
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+
+from sb3_chac.common.checks import UnsupportedActionSpace, is_finite
+
+if TYPE_CHECKING:
+    from stable_baselines3.common.vec_env import VecEnv
+
+# Keys of ``info``. The first of each list that is there, and not None, counts.
+TAKEOVER, TAKEOVER_START = "takeover", "takeover_start"
+APPLIED_ACTION, NOVICE_ACTION, RECEIVED_ACTION = "applied_action", "novice_action", "received_action"
+FLAGS = (TAKEOVER, "is_intervention")  # ours; that of gym-hil and LeRobot
+# Ours; that of HIL-SERL, gym-hil, LeRobot. Without a flag, the latter say by being there that the human acted
+REPORTED_ACTIONS = ("intervene_action", "action_intervention", "teleop_action")
+ACTIONS = (APPLIED_ACTION, *REPORTED_ACTIONS)
+
+TOLERANCE = 1e-4  # of actions scaled to [-1, 1], for rounding
+
+
+class Report(NamedTuple):
+    """
+    What ``info`` says of one step.
+
+    :param takeover: whether the human acted
+    :param action: what was executed, if the human acted, in the units of the environment that reports it
+    :param says_so: whether ``info`` tells at all who acted: a human is in the loop
+    """
+
+    takeover: bool
+    action: np.ndarray | None
+    says_so: bool
+
+
+def read_report(info: dict[str, Any], action_space: spaces.Space, env_idx: int = 0) -> Report:
+    """
+    The flag decides; only where there is none does the presence of an action. None is as good as not there.
+
+    :param info: of one step
+    :param action_space: of the actions
+    :param env_idx: the environment, for the message
+    :return: what it says, the action as a copy of the shape of ``action_space``
+    :raises ValueError: if the human acted and the action is missing, of another shape, or NaN or infinite; names the key
+    """
+    flag = _first(info, FLAGS)
+    takeover = _truth(flag[1]) if flag else _first(info, REPORTED_ACTIONS) is not None
+    if not takeover:
+        return Report(False, None, flag is not None or any(key in info for key in REPORTED_ACTIONS))
+    found = _first(info, ACTIONS)
+    if found is None:
+        assert flag is not None
+        raise ValueError(
+            f"info[{flag[0]!r}] of environment {env_idx} says that the human acted, but what was executed is missing: add it "
+            f"as info[{APPLIED_ACTION!r}] or info[{REPORTED_ACTIONS[0]!r}], in the units of the action space."
+        )
+    key, values = found
+    try:
+        action = np.array(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        action = np.array(np.nan)
+    if not is_finite(action) or action.size != np.prod(action_space.shape or (1,)):
+        raise ValueError(
+            f"info[{key!r}] of environment {env_idx}, the human's action, must be finite numbers of shape "
+            f"{action_space.shape}, got {values!r}: mend the environment. Nothing of this step was stored."
+        )
+    return Report(True, action.reshape(action_space.shape or ()), True)
+
+
+def _first(info: dict[str, Any], keys: Sequence[str]) -> tuple[str, Any] | None:
+    """
+    :return: the first of the keys whose value is there and not None, with it. LeRobot's keys are members of an Enum
+    """
+    named = {key.value if isinstance(key, Enum) else key: value for key, value in info.items()}
+    return next(((key, named[key]) for key in keys if named.get(key) is not None), None)
+
+
+def _truth(value: Any) -> bool:
+    return bool(np.any(np.asarray(value)))
+
+
+def scaled(action: np.ndarray, action_space: spaces.Space, env_idx: int) -> np.ndarray:
+    """
+    :param action: the human's, in the units of ``action_space``, a Box with finite bounds
+    :return: scaled to [-1, 1], of the same shape
+    :raises ValueError: if it is outside of the bounds
+    """
+    assert isinstance(action_space, spaces.Box)
+    low, high = action_space.low.astype(np.float64), action_space.high.astype(np.float64)
+    values = 2 * (action - low) / (high - low) - 1
+    if np.any(np.abs(values) > 1 + TOLERANCE):
+        raise ValueError(
+            f"The human's action of environment {env_idx} is out of bounds, {action} is not in {action_space}: clip it, or "
+            "report it in the units of the outermost action space. Nothing of this step was stored."
+        )
+    return np.clip(values, -1, 1)
+
+
+def changed_action(env_idx: int, sent: np.ndarray, received: np.ndarray) -> ValueError:
+    """
+    :param sent: by the algorithm
+    :param received: where the human takes over
+    """
+    return ValueError(
+        f"A wrapper of environment {env_idx} changes actions between the algorithm, which sent {sent}, and the takeover, "
+        f"where {received} arrived: the human's actions would be stored in the wrong units. Put the "
+        "InterventionWrapper outside of that wrapper. Nothing of this step was stored."
+    )
+
+
+class TakeoverWrapper(gym.Wrapper):
+    """
+    Base of the wrapper in which the human is asked. Algorithms find it by this class and reach it by one method, whose name is
+    nobody else's: whatever methods a user's environment has, they are left alone.
+    """
+
+    def sb3_chac_takeovers(self, method: str, *args: Any) -> Any:
+        """
+        :param method: of this wrapper
+        :return: what it returns
+        """
+        return getattr(self, method)(*args)
+
+    budget: int | None
+
+    def takeover_budget(self) -> int | None:
+        """
+        :return: how many steps the human drives at most
+        """
+        return self.budget
+
+    def takeover_space(self) -> spaces.Space:
+        """
+        :return: the space of the actions that are replaced in a takeover
+        """
+        return self.action_space
+
+
+class TakeoverDisplay:
+    """Base of environments whose pictures show what wrappers want to have shown (``hud``: name -> value)."""
+
+    hud: dict[str, Any]
+
+
+class _ActionWrapperAboveTakeover(type):
+    """``VecEnv.env_is_wrapped`` asks each wrapper, also in other processes, by ``isinstance``."""
+
+    def __instancecheck__(cls, wrapper: Any) -> bool:
+        changes_actions = isinstance(wrapper, gym.ActionWrapper)
+        while changes_actions and isinstance(wrapper, gym.Wrapper):
+            wrapper = wrapper.env
+            if isinstance(wrapper, TakeoverWrapper):
+                return True
+        return False
+
+
+class ActionWrapperAboveTakeover(metaclass=_ActionWrapperAboveTakeover):
+    """What is an instance of this class changes actions on their way to a ``TakeoverWrapper`` below."""
+
+
+def action_wrapper_above_report(env: gym.Env) -> gym.Wrapper | None:
+    """
+    :param env: reports takeovers, somewhere among its wrappers
+    :return: the wrapper that changes actions above all that may report them (what overrides ``step``), None if there is none
+    """
+    while isinstance(env, gym.Wrapper):
+        if type(env).step.__module__.partition(".")[0] not in ("gymnasium", "stable_baselines3"):
+            return None
+        if isinstance(env, gym.ActionWrapper):
+            return env
+        env = env.env
+    return None
+
+
+def check_report_order(env: gym.Env) -> None:
+    """
+    :param env: reports takeovers, somewhere among its wrappers
+    :raises UnsupportedActionSpace: if what it reports is not in the units of its action space
+    """
+    changer = action_wrapper_above_report(env)
+    if changer is not None:
+        raise _wrong_order(changer.env.action_space, env.action_space, type(changer).__name__)
+
+
+def _wrong_order(takeover_space: spaces.Space, action_space: spaces.Space, changer: str) -> UnsupportedActionSpace:
+    return UnsupportedActionSpace(
+        f"env: the human takes over in {takeover_space}, but the algorithm acts in {action_space}, and {changer} between them "
+        "changes the actions. The human's actions would be stored in the wrong units: take over outside of what changes "
+        "actions, e.g. InterventionWrapper(RescaleAction(env, ...)) in place of RescaleAction(InterventionWrapper(env), ...)."
+    )
+
+
+def wrapped_indices(env: "VecEnv") -> list[int]:
+    """
+    :return: indices of the environments that have a ``TakeoverWrapper``
+    """
+    return [idx for idx, wrapped in enumerate(env.env_is_wrapped(TakeoverWrapper)) if wrapped]
+
+
+def ask_wrappers(env: "VecEnv", indices: Sequence[int], method: str, *args: Any) -> list[Any]:
+    """
+    :param indices: of environments that have a ``TakeoverWrapper``
+    :param method: of it
+    :return: what each returns
+    """
+    return env.env_method("sb3_chac_takeovers", method, *args, indices=indices) if indices else []
+
+
+def check_order(env: "VecEnv") -> None:
+    """
+    :param env: training environments
+    :raises UnsupportedActionSpace: if actions are changed between the algorithm and the takeover
+    """
+    indices = wrapped_indices(env)
+    found = ask_wrappers(env, indices, "takeover_space")
+    changed = env.env_is_wrapped(ActionWrapperAboveTakeover)  # type: ignore[arg-type]
+    for idx, space in zip(indices, found, strict=True):
+        if space != env.action_space or changed[idx]:
+            raise _wrong_order(space, env.action_space, f"a wrapper of environment {idx}")

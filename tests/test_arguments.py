@@ -1,0 +1,116 @@
+"""Arguments of constructors: what one cannot be gives one error that begins with its name, before anything is built."""
+
+import inspect
+import math
+import typing
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+from test_zoo import swings
+
+import sb3_chac
+from sb3_chac.common.arguments import RANGES, annotations, fits
+from sb3_chac.common.buffers import DualReplayBuffer
+from sb3_chac.envs.safedrive import SafeDriveEnv
+from sb3_chac.human import DisagreementRule, InterventionWrapper, RiskRule
+from sb3_chac.zoo.registration import ALGORITHMS
+
+BOX = spaces.Box(-1, 1, (2,), np.float32)
+OWNERS = {
+    **{name: getattr(sb3_chac, name) for name in ALGORITHMS.values()},
+    "InterventionWrapper": InterventionWrapper,
+    "RiskRule": RiskRule,
+    "DisagreementRule": DisagreementRule,
+    "DualReplayBuffer": DualReplayBuffer,
+    "SafeDriveEnv": SafeDriveEnv,
+}
+VALUES = {"NaN": math.nan, "inf": math.inf, "text": "nonsense", "list": [1], "-1": -1, "0": 0, "True": True}
+# -1 is one of several, 0 switches something off or is the lowest: they are as good as any other number
+GOOD = {
+    "-1": {"gradient_steps", "sde_sample_freq", "target_entropy", "log_prob_threshold", "start_scenario", "sigma_threshold"},
+    "0": {
+        *(name for name, limits in RANGES.items() if 0 in limits),
+        *("learning_rate", "ent_coef_lr", "actor_lr", "lagrange_lr", "disc_learning_rate", "learning_starts", "tau", "tau_b"),
+        *("tau_c", "target_entropy", "log_prob_threshold", "sigma_threshold", "pv_coef", "pv_min_diff", "weight_decay"),
+        *("average_tau", "delta", "switch_after", "prefit_steps", "stage2_human_share", "anchor_coef", "validation_share"),
+        *("conservative_weight", "gradient_penalty", "cost_limit", "cost_gamma", "cost_gae_lambda", "cost_vf_coef"),
+        *("lagrange_start", "lagrange_init", "lagrange_max", "pid_kp", "pid_ki", "pid_kd", "pid_tau", "warm_up_steps"),
+        *("n_rounds", "target_policy_noise", "target_noise_clip", "budget", "delay", "smoothing", "threshold"),
+        *("start_scenario", "traffic_density", "obstacle_density", "displacement_reward", "speed_reward", "gradient_steps"),
+        *("collision_penalty", "arrival_reward", "out_of_road_penalty"),
+    },
+    "text": {"tensorboard_log", "dataset"},  # a folder; what is not there is told when it is read
+}
+NOT_CHECKED = {"self", "_init_setup_model", "kwargs"}
+
+
+def required(owner):
+    """What the constructor needs besides."""
+    env = gym.make("Pendulum-v1")
+    parameters = inspect.signature(owner).parameters
+    found = {"policy": "MlpPolicy", "env": env, "expert": lambda observation: [0.0], "rule": "never", "threshold": 0.1}
+    found |= {"time_to_trouble": lambda observation, action: 1.0, "observation_space": BOX, "action_space": BOX}
+    found |= {"buffer_size": 10, "policy_kwargs": {"net_arch": [8]}}
+    return {name: value for name, value in found.items() if name in parameters}
+
+
+def bad_values(owner):
+    """
+    :return: names of arguments, and values that they cannot have
+    """
+    hints = annotations(owner.__init__)
+    for name in inspect.signature(owner).parameters:
+        if name in NOT_CHECKED:
+            continue
+        for label, value in VALUES.items():
+            may_be = hints.get(name) is not typing.Any and fits(value, hints.get(name))
+            if name in GOOD.get(label, ()) and may_be:
+                continue
+            if label == "True" and may_be:
+                continue
+            yield name, label, value
+
+
+@pytest.mark.parametrize("owner", OWNERS.values(), ids=OWNERS)
+def test_what_an_argument_cannot_be_is_named(owner):
+    others = required(owner)
+    tried, silent, unnamed = 0, [], []
+    for name, label, value in bad_values(owner):
+        tried += 1
+        try:
+            owner(**{**others, name: value})
+        except Exception as error:
+            if not isinstance(error, ValueError) or name not in str(error):
+                unnamed.append(f"{name}={label}: {type(error).__name__}: {error}")
+        else:
+            silent.append(f"{name}={label}")
+    assert tried > 10
+    assert not silent and not unnamed, f"of {tried}, taken: {silent}; without a name: {unnamed}"
+
+
+@pytest.mark.parametrize("owner", OWNERS.values(), ids=OWNERS)
+def test_what_signatures_say_is_what_the_defaults_are(owner):
+    hints = annotations(owner.__init__)
+    for name, parameter in inspect.signature(owner).parameters.items():
+        if name not in NOT_CHECKED and parameter.default is not inspect.Parameter.empty:
+            assert fits(parameter.default, hints[name]), name
+
+
+@pytest.mark.parametrize(
+    "schedule, is_good", [(lambda left: 0.2 * left, True), (lambda left: math.nan, False), (lambda left: -left, False)]
+)
+@pytest.mark.parametrize("name", ["clip_range", "clip_range_vf", "learning_rate"])
+@pytest.mark.parametrize("algorithm", [sb3_chac.PPOLag, sb3_chac.GAIL])
+def test_schedules_are_looked_into(algorithm, name, schedule, is_good):
+    dataset = {"dataset": swings()} if algorithm is sb3_chac.GAIL else {}
+
+    def make():
+        return algorithm("MlpPolicy", "Pendulum-v1", **dataset, **{name: schedule})
+
+    if is_good:
+        make()
+    else:
+        with pytest.raises(ValueError, match=f"^{name} must be"):
+            make()

@@ -1,0 +1,108 @@
+"""Files that others made: what they say is read, and nothing that they name is run."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.envs.registration import EnvSpec
+
+from sb3_chac.cockpit.recording import ABOUT, FOLDER, Recorder, finish_recording
+from sb3_chac.common.episodes import NotEvaluable, registered_spec
+from sb3_chac.demos import main as demos
+from sb3_chac.human.recording import record
+
+ROOT = Path(__file__).parents[1]
+EVIL = {
+    "entry point": {"entry_point": "os:system"},
+    "another id": {"id": "Evil-v0", "entry_point": "os:system"},
+    "a module in the id": {"id": "antigravity:Evil-v0"},
+    "vector entry point": {"id": "Evil-v0", "vector_entry_point": "os:system"},
+    "a wrapper": {"additional_wrappers": [{"name": "Evil", "entry_point": "os:system", "kwargs": {"command": "touch ran"}}]},
+}
+
+
+@pytest.fixture
+def no_code(monkeypatch, tmp_path):
+    """Fails if one of the named things is run or imported."""
+    monkeypatch.chdir(tmp_path)
+    ran: list[str] = []
+    monkeypatch.setattr(os, "system", lambda *args, **kwargs: ran.append(str((args, kwargs))))
+    yield
+    assert ran == [] and "antigravity" not in sys.modules
+
+
+def changed(text: str, harm: dict) -> str:
+    return json.dumps(json.loads(text) | harm)
+
+
+@pytest.mark.parametrize("harm", EVIL.values(), ids=EVIL)
+def test_a_dataset_names_registered_environments_only(tmp_path, no_code, harm, capsys):
+    folder = record(tmp_path / "set-v0", lambda observation: np.zeros(1, np.float32), "Pendulum-v1", 10)
+    file = next(folder.rglob("metadata.json"))
+    metadata = json.loads(file.read_text())
+    metadata["env_spec"] = changed(metadata["env_spec"], harm | {"kwargs": {"command": "touch ran"}})
+    file.write_text(json.dumps(metadata))
+    with pytest.raises(SystemExit) as ended:
+        demos(["replay", "--dataset", str(folder)])
+    error = capsys.readouterr().err
+    assert ended.value.code == 2 and error.count("\n") == 1, error
+
+
+@pytest.mark.parametrize("harm", EVIL.values(), ids=EVIL)
+def test_a_drive_is_recovered_without_making_its_environment(tmp_path, no_code, harm):
+    env = gym.make("Pendulum-v1")
+    recorder = Recorder(tmp_path, env, str(tmp_path / "drive-v0"), "test", 0.1)
+    observation, _ = env.reset(seed=0)
+    recorder.begin(observation, 0, None)
+    info = {"applied_action": np.zeros(1, np.float32), "takeover": False, "cost": 0.0}
+    recorder.add(np.zeros(1, np.float32), observation, 0.0, False, True, info)
+    file = tmp_path / FOLDER / ABOUT
+    about = json.loads(file.read_text())
+    file.write_text(json.dumps(about | {"spec": changed(about["spec"], harm)}))
+    summary = finish_recording(tmp_path)
+    assert summary is not None and summary.steps == 1
+
+
+def test_a_registered_environment_keeps_the_keywords_of_the_file():
+    spec = registered_spec(EnvSpec("SafeDrive-v0", entry_point="os:system", kwargs={"horizon": 7}), "a file")
+    assert spec.kwargs["horizon"] == 7 and spec.entry_point == gym.spec("SafeDrive-v0").entry_point
+    with pytest.raises(NotEvaluable, match=r"^a file: the environment 'Nowhere-v0' is not registered"):
+        registered_spec(EnvSpec("Nowhere-v0", entry_point="os:system"), "a file")
+
+
+START = """
+import os, site, sys
+del os.environ["SB3_CHAC_NO_AUTOLOAD"]
+os.environ.update({variables!r})
+sys.meta_path[:] = [finder for finder in sys.meta_path if "sb3_chac" not in str(finder)]
+site.addpackage({root!r}, "sb3_chac.pth", set())
+hooked = any("ZooFinder" in str(finder) for finder in sys.meta_path)
+import gymnasium
+print(hooked, "SafeDrive-v0" in gymnasium.registry, sys.modules.get("sb3_chac"))
+"""
+
+
+def start(cwd: Path, **variables: str) -> str:
+    environment = os.environ | {"PYTHONPATH": ":", "SB3_CHAC_NO_AUTOLOAD": "1"}
+    code = START.format(root=str(ROOT), variables=variables)
+    return subprocess.run(
+        [sys.executable, "-c", code], cwd=cwd, env=environment, capture_output=True, text=True, check=True
+    ).stdout
+
+
+def test_the_start_up_hook_runs_no_strangers_package(tmp_path):
+    (tmp_path / "sb3_chac").mkdir()
+    for name in ("__init__", "_startup"):
+        (tmp_path / "sb3_chac" / f"{name}.py").write_text("open('ran', 'w')\n")
+    output = start(tmp_path)
+    assert output.startswith("True True") and str(ROOT / "sb3_chac") in output
+    assert not (tmp_path / "ran").exists()
+
+
+def test_the_start_up_hook_asks_first_whether_it_is_wanted(tmp_path):
+    assert start(tmp_path, SB3_CHAC_NO_AUTOLOAD="1").startswith("False False None")
