@@ -130,4 +130,5 @@ def make_batch(observations, actions, takeovers, **columns):
         th.as_tensor(takeovers, dtype=th.float32).reshape(n_rows, 1),
         as_column.get("takeover_starts", zeros),
         as_column.get("costs", zeros),
+        as_column.get("takeovers_follow", zeros),
     )

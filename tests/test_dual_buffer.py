@@ -441,3 +441,38 @@ def test_a_buffer_of_an_older_version_has_no_costs(n_steps):
         add(older, t)
     older.end_trajectories()
     assert times(older.novice) == list(range(10))
+
+
+@pytest.mark.parametrize("n_steps", [1, 2])
+@pytest.mark.parametrize(
+    "takeovers, done_at, marked",
+    [
+        ("000110010", (), [2, 6]),
+        ("0011", (1,), []),  # another episode: the human drove from its first step on
+        ("1100", (), []),
+        ("0101", (), [0, 2]),
+    ],
+)
+def test_the_step_before_a_takeover_is_marked(takeovers, done_at, marked, n_steps):
+    buffer = make_buffer(n_steps=n_steps)
+    for t, human in enumerate(takeovers):
+        start = human == "1" and (t == 0 or takeovers[t - 1] == "0")
+        add(buffer, t, takeover=human == "1", start=start, done=t in done_at)
+    buffer.end_trajectories()
+    following = {int(obs[0]): value for obs, value in rows(buffer.novice, "observation/", "takeover_follows")}
+    assert {t: value for t, value in following.items() if value} == dict.fromkeys(marked, 1.0)
+    assert not any(value for (value,) in rows(buffer.human, "takeover_follows"))
+
+
+def test_each_environment_marks_its_own_step():
+    buffer = make_buffer(n_envs=2)
+    add(buffer, 0)
+    add(buffer, 1, takeover=[False, True], start=[False, True])
+    assert rows(buffer.novice, "observation/", "takeover_follows") == [([0.0, 0.0], 0.0), ([0.0, 1.0], 1.0), ([1.0, 0.0], 0.0)]
+
+
+def test_a_row_that_was_overwritten_is_not_marked():
+    buffer = make_buffer(n_envs=2, capacity=1)
+    add(buffer, 0)  # the second environment overwrites the first one's row
+    add(buffer, 1, takeover=[True, False], start=[True, False])
+    assert not any(value for (value,) in rows(buffer.novice, "takeover_follows"))

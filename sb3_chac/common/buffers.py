@@ -17,7 +17,7 @@ from sb3_chac.common.contract import NOVICE_ACTION, TAKEOVER, TAKEOVER_START
 
 Observation = np.ndarray | dict[str, np.ndarray]
 # Columns of a store with one number a row
-SCALARS = ("reward", "discount", "done", "takeover", "takeover_start", "cost")
+SCALARS = ("reward", "discount", "done", "takeover", "takeover_start", "cost", "takeover_follows")
 
 
 class DualReplayBufferSamples(NamedTuple):
@@ -33,6 +33,7 @@ class DualReplayBufferSamples(NamedTuple):
     takeovers: th.Tensor  # I, 1 where the human drove
     takeover_starts: th.Tensor  # 1 on the first step of a takeover
     costs: th.Tensor  # safety costs, summed up as the rewards are
+    takeovers_follow: th.Tensor  # 1 where the human took over in the next step; returns that were complete by then have 0
 
 
 def take_rows(observations: th.Tensor | TensorDict, rows: th.Tensor) -> Any:
@@ -73,6 +74,16 @@ class TransitionStore:
         for name, array in self.arrays.items():
             array[self.added % self.capacity] = row[name]
         self.added += 1
+
+    def replace(self, number: int, name: str, value: float) -> None:
+        """
+        Change an entry of a row that was appended as the ``number``-th, unless it has been overwritten since.
+
+        :param number: from 0
+        :param name: of the column
+        """
+        if number >= self.added - self.capacity:
+            self.arrays[name][number % self.capacity] = value
 
     def sample(self, n_rows: int) -> dict[str, np.ndarray]:
         """
@@ -159,11 +170,14 @@ class DualReplayBuffer(ReplayBuffer):
         self.human = TransitionStore(buffer_size, columns)
         # Transitions of each environment whose return is not complete yet
         self.pending: defaultdict[int, deque[dict[str, Any]]] = defaultdict(deque)
+        # Number of the novice's row that each environment stored last, in this episode
+        self.last_novice_row: dict[int, int] = {}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
         for store in (self.novice, self.human):
             store.complete(dict.fromkeys(SCALARS, ((1,), np.float32)))
+        self.last_novice_row = state.get("last_novice_row", {})
         for row in chain.from_iterable(self.pending.values()):
             row |= {name: np.zeros(1, np.float32) for name in SCALARS if name not in row}
 
@@ -176,6 +190,7 @@ class DualReplayBuffer(ReplayBuffer):
     def reset(self) -> None:
         self.novice.added = self.human.added = 0
         self.pending.clear()
+        self.last_novice_row.clear()
 
     def add(
         self,
@@ -206,9 +221,15 @@ class DualReplayBuffer(ReplayBuffer):
                 "takeover": bool(info.get(TAKEOVER, False)),
                 "takeover_start": bool(info.get(TAKEOVER_START, False)),
                 "cost": float(info.get("cost") or 0.0),  # None: not measured
+                "takeover_follows": 0.0,
             }
+            if row["takeover_start"]:
+                self._mark_step_before(idx)
             if self.n_steps == 1:
                 self._append(row)
+                self.last_novice_row.pop(idx, None)
+                if not (row["takeover"] or done[idx]):
+                    self.last_novice_row[idx] = self.novice.added - 1
                 continue
             pending = self.pending[idx]
             if pending and pending[-1]["takeover"] != row["takeover"]:
@@ -218,6 +239,13 @@ class DualReplayBuffer(ReplayBuffer):
                 self._flush(pending)
             elif len(pending) == self.n_steps:
                 self._append_return(pending)
+
+    def _mark_step_before(self, idx: int) -> None:
+        """Note that the human took over after the novice's last step in an environment."""
+        if self.pending[idx]:
+            self.pending[idx][-1]["takeover_follows"] = np.array(1.0)
+        elif idx in self.last_novice_row:
+            self.novice.replace(self.last_novice_row[idx], "takeover_follows", 1.0)
 
     @staticmethod
     def _entries(kind: str, obs: Observation, idx: int) -> dict[str, np.ndarray]:
@@ -229,7 +257,10 @@ class DualReplayBuffer(ReplayBuffer):
     def _append_return(self, pending: deque[dict[str, Any]]) -> None:
         """Completes the oldest transition: rewards up to the last one, then its next observation."""
         ends = {name: value for name, value in pending[-1].items() if name == "done" or name.startswith("next_observation/")}
-        sums = {name: sum(self.gamma**k * row[name] for k, row in enumerate(pending)) for name in ("reward", "cost")}
+        sums = {
+            name: sum(self.gamma**k * row[name] for k, row in enumerate(pending))
+            for name in ("reward", "cost", "takeover_follows")
+        }
         self._append(pending.popleft() | ends | sums | {"discount": self.gamma ** (len(pending) + 1)})
 
     def _flush(self, pending: deque[dict[str, Any]]) -> None:
@@ -278,6 +309,7 @@ class DualReplayBuffer(ReplayBuffer):
             to_torch["takeover"],
             to_torch["takeover_start"],
             to_torch["cost"],
+            to_torch["takeover_follows"],
         )
 
     def _observations(self, kind: str, columns: dict[str, np.ndarray], env: VecNormalize | None) -> Any:
