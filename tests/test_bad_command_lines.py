@@ -123,10 +123,9 @@ def complaint(tmp_path, monkeypatch, capsys):
         with pytest.raises(SystemExit) as ended:
             sb3_chac()
         assert ended.value.code == 2
-        # argparse tells how it is used first
-        lines = [
-            line for line in capsys.readouterr().err.splitlines() if not re.match("usage:| ", line) and "Warning" not in line
-        ]
+        # argparse tells how it is used first, and there may be a progress bar
+        printed = capsys.readouterr().err.splitlines()
+        lines = [line for line in printed if line and not re.search("^usage:|^ |Warning|episode/s", line)]
         assert len(lines) == 1, lines
         return lines[0]
 
