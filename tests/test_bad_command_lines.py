@@ -5,6 +5,7 @@ import sys
 
 import pytest
 import yaml
+from test_demo import write_run
 
 from sb3_chac.__main__ import main as sb3_chac
 from sb3_chac.zoo import register
@@ -122,10 +123,9 @@ def complaint(tmp_path, monkeypatch, capsys):
         with pytest.raises(SystemExit) as ended:
             sb3_chac()
         assert ended.value.code == 2
-        # argparse tells how it is used first
-        lines = [
-            line for line in capsys.readouterr().err.splitlines() if not re.match("usage:| ", line) and "Warning" not in line
-        ]
+        # argparse tells how it is used first, and there may be a progress bar
+        printed = capsys.readouterr().err.splitlines()
+        lines = [line for line in printed if line and not re.search("^usage:|^ |Warning|episode/s", line)]
         assert len(lines) == 1, lines
         return lines[0]
 
@@ -178,3 +178,17 @@ OWN = [
 @pytest.mark.parametrize("arguments, named", OWN, ids=[arguments[:50] for arguments, _ in OWN])
 def test_our_own_commands(complaint, arguments, named):
     assert named in complaint(arguments.split())
+
+
+# A full disk: whatever is written to this device fails with "No space left on device"
+
+
+def test_evaluate_on_a_full_disk(complaint):
+    quick = ["--scenarios", "1000", "--env-kwargs", "horizon:3", "blocks:1", "--jobs", "1"]
+    assert "No space left" in complaint(["evaluate", "--expert", "scripted", *quick, "--json", "/dev/full"])
+
+
+def test_plot_on_a_full_disk(complaint, tmp_path):
+    run = write_run(tmp_path / "run", [100])
+    (tmp_path / "curves.png").symlink_to("/dev/full")
+    assert "No space left" in complaint(["plot", str(run), "--out", "curves.png"])

@@ -8,6 +8,7 @@ from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_chac import DSAC
+from sb3_chac.envs.safedrive import SafeDriveEnv
 
 
 def small():
@@ -167,7 +168,7 @@ def test_nan_in_a_dict_observation_names_the_key_and_the_environment():
 
 @pytest.mark.parametrize("action", [[np.nan, 0], [0, np.inf], [0], [0, 0, 0], "left", None])
 def test_actions_that_are_none_do_not_move_the_car(action):
-    env = gym.make("SafeDrive-v0", horizon=5).unwrapped
+    env = SafeDriveEnv(horizon=5)
     env.reset(seed=0)
     with pytest.raises(ValueError, match=r"^action must be two finite numbers.*got.*did not make a step"):
         env.step(action)

@@ -100,7 +100,7 @@ def check_argument(name: str, value: Any, hint: Any) -> None:
     limits = RANGES.get(name)
     for number in numbers_in(value):
         if limits is not None and number not in limits:
-            kind = describe(hint) if hint in (int, float) else "a number"
+            kind = "a finite number" if fits(0.5, hint) else "an integer"
             raise ValueError(f"{name} must be {kind} {limits}, got {value!r}.")
     if name in SCHEDULES and callable(value):
         start, end = float(value(1.0)), float(value(0.0))
