@@ -15,6 +15,7 @@ from sb3_chac.common.checkpoints import ResumableCheckpoint
 SOURCES = {
     "observation": "observation of environment 0",
     "first observation": "observation of environment 0",
+    "very first observation": "observation of environment 0",
     "terminal observation": "terminal observation of environment 0",
     "reward": "reward of environment 0",
     "cost": r"info\['cost'\] of environment 0",
@@ -36,7 +37,7 @@ class Broken(Walk):
     def reset(self, seed=None, options=None):
         observation, info = super().reset(seed=seed)
         observation = observation.astype(np.float64)
-        if self.source == "first observation" and self.count == BREAKS_AT:
+        if (self.source, self.count) in (("first observation", BREAKS_AT), ("very first observation", 0)):
             observation[1] = self.value
         return observation, info
 
@@ -45,7 +46,8 @@ class Broken(Walk):
         observation = observation.astype(np.float64)
         self.count += 1
         human = self.count % 2 == 0
-        info |= {"intervene_action": np.zeros(2)} if human else {}
+        key = "applied_action" if self.source == "applied_action" else "intervene_action"
+        info |= {key: np.zeros(2), "is_intervention": True} if human else {}
         at = BREAKS_AT - 2 if self.source == "observation" else BREAKS_AT  # not the last one of the episode
         if self.count == at:
             if self.source in ("observation", "terminal observation"):
@@ -97,7 +99,7 @@ def float64_demonstrations(**columns):
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf], ids=["nan", "inf"])
-@pytest.mark.parametrize("source", ["observation", "reward"])
+@pytest.mark.parametrize("source", ["observation", "very first observation", "reward"])
 @pytest.mark.parametrize("name", [name for name in ALL if name not in OFFLINE])
 def test_normalizing_hides_nothing(name, source, value):
     """Statistics that are not in training clip what is infinite."""

@@ -1,5 +1,6 @@
 """Refuses steps of the environments that are not finite, for the algorithms that learn from rollouts."""
 
+import numpy as np
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
@@ -7,13 +8,14 @@ from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
-from sb3_chac.common.checks import check_finite, check_step
+from sb3_chac.common.checks import check_reset, check_step
+from sb3_chac.common.own_arrays import keep_last_observations
 from sb3_chac.common.utils import detach_distributions
 
 
 class CheckedVecEnv(VecEnvWrapper):
     """
-    Raises one error for the first observation, reward or cost that is NaN or infinite.
+    Raises one error for the first observation, reward or cost that is NaN or infinite; gives copies of the actions away.
 
     :param venv: the environments
     :param model: that learns in them
@@ -25,6 +27,9 @@ class CheckedVecEnv(VecEnvWrapper):
 
     def reset(self) -> VecEnvObs:
         return self.venv.reset()
+
+    def step_async(self, actions: np.ndarray) -> None:
+        self.venv.step_async(actions.copy())  # what is stored are the actions: the environments may change theirs
 
     def step_wait(self) -> VecEnvStepReturn:
         observations, rewards, dones, infos = self.venv.step_wait()
@@ -46,8 +51,10 @@ class CheckedRollouts(OnPolicyAlgorithm):
         tb_log_name: str = "run",
         progress_bar: bool = False,
     ) -> tuple[int, BaseCallback]:
+        assert self.env is not None
+        keep_last_observations(self.env)
         prepared = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
-        check_finite("observation", self._last_obs, self.num_timesteps)  # type: ignore[arg-type]
+        check_reset(self._last_obs, self._vec_normalize_env, self.num_timesteps)  # type: ignore[arg-type]
         return prepared
 
     def train(self) -> None:

@@ -22,7 +22,7 @@ APPLIED_ACTION, NOVICE_ACTION, RECEIVED_ACTION = "applied_action", "novice_actio
 FLAGS = (TAKEOVER, "is_intervention")  # ours; that of gym-hil and LeRobot
 # Ours; that of HIL-SERL, gym-hil, LeRobot. Without a flag, the latter say by being there that the human acted
 REPORTED_ACTIONS = ("intervene_action", "action_intervention", "teleop_action")
-ACTIONS = (APPLIED_ACTION, *REPORTED_ACTIONS)
+ACTIONS = (*REPORTED_ACTIONS, APPLIED_ACTION)  # ours, which only a flag makes a report, may be the environment's own
 
 TOLERANCE = 1e-4  # of actions scaled to [-1, 1], for rounding
 
@@ -180,6 +180,31 @@ def action_wrapper_above_report(env: gym.Env) -> gym.Wrapper | None:
     return None
 
 
+class _ReportsBelow:
+    """``VecEnv.env_is_wrapped`` asks each wrapper, the outermost first, which answers for all. Good for one environment."""
+
+    is_asked = False
+
+    def __instancecheck__(self, wrapper: Any) -> bool:
+        is_first, self.is_asked = not self.is_asked, True
+        return is_first and action_wrapper_above_report(wrapper) is not None
+
+
+def check_reports(env: "VecEnv", idx: int) -> None:
+    """
+    :param env: training environments
+    :param idx: of one that reports a takeover
+    :raises UnsupportedActionSpace: if one can see that it does so in other units than those of the algorithm
+    """
+    base: Any = env.unwrapped
+    if base.action_space != env.action_space:
+        raise _wrong_order(base.action_space, env.action_space, "a VecEnvWrapper")
+    if hasattr(base, "envs"):  # in this process: the message names more
+        check_report_order(base.envs[idx])
+    elif base.env_is_wrapped(_ReportsBelow(), indices=idx)[0]:
+        raise _wrong_order("a space of its own", env.action_space, f"a wrapper of environment {idx}")
+
+
 def check_report_order(env: gym.Env) -> None:
     """
     :param env: reports takeovers, somewhere among its wrappers
@@ -190,12 +215,24 @@ def check_report_order(env: gym.Env) -> None:
         raise _wrong_order(changer.env.action_space, env.action_space, type(changer).__name__)
 
 
-def _wrong_order(takeover_space: spaces.Space, action_space: spaces.Space, changer: str) -> UnsupportedActionSpace:
+def _wrong_order(takeover_space: spaces.Space | str, action_space: spaces.Space, changer: str) -> UnsupportedActionSpace:
     return UnsupportedActionSpace(
         f"env: the human takes over in {takeover_space}, but the algorithm acts in {action_space}, and {changer} between them "
         "changes the actions. The human's actions would be stored in the wrong units: take over outside of what changes "
         "actions, e.g. InterventionWrapper(RescaleAction(env, ...)) in place of RescaleAction(InterventionWrapper(env), ...)."
     )
+
+
+def check_takeover_order(env: gym.Env) -> None:
+    """
+    :param env: an environment, with its wrappers
+    :raises UnsupportedActionSpace: if one of them changes actions above a ``TakeoverWrapper``
+    """
+    wrapper = env
+    while isinstance(wrapper, gym.Wrapper):
+        if isinstance(wrapper, ActionWrapperAboveTakeover):
+            raise _wrong_order(wrapper.env.action_space, env.action_space, type(wrapper).__name__)
+        wrapper = wrapper.env
 
 
 def wrapped_indices(env: "VecEnv") -> list[int]:

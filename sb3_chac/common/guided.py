@@ -13,11 +13,11 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.utils import safe_mean
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_chac.common import contract
 from sb3_chac.common.buffers import DualReplayBuffer
-from sb3_chac.common.checks import check_action_space, check_finite, number_in
+from sb3_chac.common.checks import check_action_space, check_reset, number_in
 from sb3_chac.common.off_policy_algorithm import CheckedOffPolicyAlgorithm
 from sb3_chac.human.demonstrations import Dataset, load_demonstrations
 
@@ -241,7 +241,7 @@ class GuidedOffPolicyAlgorithm(CheckedOffPolicyAlgorithm):
         self.replay_buffer.end_trajectories()
         self._forget_episodes()
         self._last_obs = self.env.reset()  # type: ignore[assignment]
-        check_finite("observation", self._last_obs, self.num_timesteps)  # type: ignore[arg-type]
+        check_reset(self._last_obs, self._vec_normalize_env, self.num_timesteps)  # type: ignore[arg-type]
         if self._vec_normalize_env is not None:
             self._last_original_obs = self._vec_normalize_env.get_original_obs()
 
@@ -281,10 +281,12 @@ class GuidedOffPolicyAlgorithm(CheckedOffPolicyAlgorithm):
         reports = [contract.read_report(info, self.action_space, idx) for idx, info in enumerate(infos)]
         executed = np.array(buffer_action, dtype=np.float32)
         marked = []
+        assert self.env is not None
         for idx, (info, report) in enumerate(zip(infos, reports, strict=True)):
             self._check_received(idx, info, buffer_action[idx])
             if report.action is not None:
-                self._check_units(idx)
+                if idx not in self._wrapped and not self.human_driving[idx]:
+                    contract.check_reports(self.env, idx)
                 executed[idx] = contract.scaled(report.action, self.action_space, idx)
             start = info.get(contract.TAKEOVER_START)
             if start is None:
@@ -296,22 +298,12 @@ class GuidedOffPolicyAlgorithm(CheckedOffPolicyAlgorithm):
         self._human_was_seen |= any(report.says_so for report in reports)
         self._count(marked, dones)
 
-    def _check_units(self, idx: int) -> None:
-        """
-        :param idx: of an environment that reports a takeover
-        :raises UnsupportedActionSpace: if one can see that it does so in other units than those of the algorithm
-        """
-        assert self.env is not None
-        base = self.env.unwrapped
-        if idx not in self._wrapped and isinstance(base, DummyVecEnv):
-            contract.check_report_order(base.envs[idx])
-
     def _check_received(self, idx: int, info: dict[str, Any], sent: np.ndarray) -> None:
         """
         :param sent: scaled to [-1, 1]
         :raises ValueError: if another action arrived where the human takes over than the one that was sent
         """
-        received = info.get(contract.RECEIVED_ACTION)
+        received = info.get(contract.RECEIVED_ACTION) if idx in self._wrapped else None  # else it is the environment's own
         if received is None:
             return
         sent = np.asarray(self.policy.unscale_action(sent), np.float64)

@@ -20,8 +20,10 @@ from sb3_chac.common.checks import (
     check_integer,
     check_learning_rate,
     check_range,
+    check_reset,
     check_step,
 )
+from sb3_chac.common.own_arrays import keep_last_observations
 
 
 class CheckedOffPolicyAlgorithm(OffPolicyAlgorithm):
@@ -70,8 +72,10 @@ class CheckedOffPolicyAlgorithm(OffPolicyAlgorithm):
         tb_log_name: str = "run",
         progress_bar: bool = False,
     ) -> tuple[int, BaseCallback]:
+        assert self.env is not None
+        keep_last_observations(self.env)
         prepared = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
-        check_finite("observation", self._last_obs, self.num_timesteps)  # type: ignore[arg-type]
+        check_reset(self._last_obs, self._vec_normalize_env, self.num_timesteps)  # type: ignore[arg-type]
         return prepared
 
     def _store_transition(

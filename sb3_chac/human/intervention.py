@@ -54,7 +54,7 @@ class InterventionWrapper(contract.TakeoverWrapper, RecordConstructorArgs):
     takeover            bool        the human drove this step
     takeover_start      bool        it is the first step of a takeover
     applied_action      np.ndarray  what was executed, a copy, in the units and dtype of the action space
-    received_action     np.ndarray  what the novice proposed, as it arrived here, while the human watches
+    received_action     np.ndarray  what the novice proposed, as it arrived here; None while nobody watches
     takeover_cost       float       on the first step of a takeover 1 - cos(novice action, human's action), both
                                     scaled to [-1, 1]: 0 (same direction) to 2 (opposite); 0 if either is zero
     intervene_action    np.ndarray  the human's action, on takeover steps (HIL-SERL's key)
@@ -158,12 +158,14 @@ class InterventionWrapper(contract.TakeoverWrapper, RecordConstructorArgs):
 
     def arm(self, step_by_step: bool = False) -> None:
         """
-        From the next step on the human watches, also in the middle of an episode. Does nothing if armed already.
+        From the next step on the human watches, also in the middle of an episode. If armed already, it goes on as it is.
 
-        :param step_by_step: only in the steps that ``begin_step`` announces; in all others the wrapper is inert
+        :param step_by_step: only in the steps that ``begin_step`` announces; in all others the wrapper is inert. That also
+            holds for a wrapper that is armed already
         :raises ValueError: if the environment does not know the expert, or "risk" is the rule and the expert predicts nothing
         """
         if self._armed:
+            self._step_by_step |= step_by_step
             return
         if self._expert is None or self._rule is None:
             expert = make_expert(self._expert_argument, self.env)
@@ -251,7 +253,7 @@ class InterventionWrapper(contract.TakeoverWrapper, RecordConstructorArgs):
             self._has_to_start = False
             self._start()
         novice_action = self._checked_novice_action(action) if watches else np.array(action, self._box.dtype)
-        received_action = {contract.RECEIVED_ACTION: np.array(action, np.float64)} if watches else {}
+        received_action = np.array(action, np.float64) if watches else None
         # If anything below fails it stays so: the human does not drive, and only reset() goes on
         observation, self._observation = self._observation, None
         was_driving = self._state is ControlState.TAKEOVER
@@ -283,7 +285,7 @@ class InterventionWrapper(contract.TakeoverWrapper, RecordConstructorArgs):
             self._on("pause")
         info = {
             **info,
-            **received_action,
+            contract.RECEIVED_ACTION: received_action,
             contract.TAKEOVER: takeover,
             contract.TAKEOVER_START: starts,
             contract.APPLIED_ACTION: applied_action,

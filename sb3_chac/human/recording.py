@@ -22,8 +22,16 @@ from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.common.vec_env.base_vec_env import CloudpickleWrapper
 from tqdm import tqdm
 
-from sb3_chac.common.checks import check_integer
-from sb3_chac.common.contract import NOVICE_ACTION, TAKEOVER, read_report
+from sb3_chac.common.checks import UnsupportedActionSpace, check_integer, number_in
+from sb3_chac.common.contract import (
+    NOVICE_ACTION,
+    TAKEOVER,
+    TakeoverWrapper,
+    check_report_order,
+    check_takeover_order,
+    read_report,
+    scaled,
+)
 from sb3_chac.common.episodes import Runner, SavedModel, Task, make_env
 from sb3_chac.common.evaluation import policy_name, saved_model, scenario_list
 from sb3_chac.human.dataset_writer import DatasetWriter, folder_to_make
@@ -129,6 +137,7 @@ class Recorder(Runner):
     :param task: what to record
     :param scenarios: take turns, None for those that the environment chooses
     :raises DatasetError: if a dataset cannot hold observations or actions
+    :raises UnsupportedActionSpace: if actions are changed above an ``InterventionWrapper``
     """
 
     def __init__(self, task: Task, scenarios: list[int] | None) -> None:
@@ -136,7 +145,8 @@ class Recorder(Runner):
         self.scenarios = scenarios
         try:
             check_spaces(self.env.observation_space, self.env.action_space)
-        except DatasetError:
+            check_takeover_order(self.env)
+        except (DatasetError, UnsupportedActionSpace):
             self.env.close()
             raise
 
@@ -155,7 +165,9 @@ class Recorder(Runner):
         observation, _ = self.env.reset(seed=seed, options=options)
         if hasattr(self.driver, "reset"):
             self.driver.reset(seed)
-        observations, actions, steps = [np.array(observation)], [], []
+        observations, actions = [np.array(observation)], []
+        proposals: list[Any] = []
+        told: list[dict[str, Any]] = []
         rewards: list[float] = []
         terminations: list[bool] = []
         truncations: list[bool] = []
@@ -164,14 +176,14 @@ class Recorder(Runner):
             proposed = copy.deepcopy(action)  # the environment may change what it is given
             observation, reward, terminated, truncated, info = self.env.step(action)
             observations.append(np.array(observation))
-            executed = read_report(info, self.env.action_space).action
-            actions.append(proposed if executed is None else executed)
+            actions.append(self._executed(proposed, info))
             rewards.append(float(reward))
             terminations.append(bool(terminated))
             truncations.append(bool(truncated))
-            steps.append(self.stored_infos(proposed, info, self.env.action_space))
+            proposals.append(proposed)
+            told.append(dict(copy.deepcopy(info)))
         stacked = np.array(observations, self.env.observation_space.dtype)
-        if not (np.isfinite(stacked).all() and np.isfinite(rewards).all()):
+        if not all(np.isfinite(values).all() for values in (stacked, rewards, actions)):
             raise ValueError(f"episode {number} of {self.env.unwrapped} has NaN or infinite values: mend the environment.")
         return EpisodeBuffer(
             seed=seed,
@@ -182,8 +194,35 @@ class Recorder(Runner):
             terminations=terminations,
             truncations=truncations,
             # The first entries belong to the reset
-            infos={key: np.array([np.zeros_like(steps[0][key]), *(step[key] for step in steps)]) for key in steps[0]},
+            infos=self._stacked_infos(proposals, told),
         )
+
+    def _executed(self, proposed: Any, info: dict[str, Any]) -> Any:
+        """
+        :return: what was executed instead of ``proposed`` if the human took over
+        :raises ValueError: if that is not in the units of the action space, as far as one can see
+        """
+        space = self.env.action_space
+        executed = read_report(info, space).action
+        if executed is None:
+            return proposed
+        if not isinstance(self.env, TakeoverWrapper):
+            check_report_order(self.env)
+        if isinstance(space, spaces.Box) and space.is_bounded():
+            scaled(executed, space, 0)
+        return executed
+
+    def _stacked_infos(self, proposals: list[Any], told: list[dict[str, Any]]) -> dict[str, np.ndarray]:
+        """
+        :param proposals: what the driver proposed, at each step
+        :param told: ``info`` of each step
+        :return: per key zero for the reset, then what a dataset holds of each step; zero where one does not tell
+        """
+        space = self.env.action_space
+        someone_watches = any(read_report(info, space).says_so for info in told)  # some only tell of what they drive
+        steps = [self.stored_infos(*step, space, someone_watches) for step in zip(proposals, told, strict=True)]
+        zeros = {key: np.zeros_like(value) for step in steps for key, value in step.items()}
+        return {key: np.array([zero, *(step.get(key, zero) for step in steps)]) for key, zero in zeros.items()}
 
     def _in_space(self, action: Any) -> Any:
         """
@@ -193,18 +232,24 @@ class Recorder(Runner):
         return int(action) if isinstance(space, spaces.Discrete) else np.array(action, space.dtype)
 
     @staticmethod
-    def stored_infos(action: Any, info: dict[str, Any], action_space: spaces.Space) -> dict[str, Any]:
+    def stored_infos(
+        action: Any, info: dict[str, Any], action_space: spaces.Space, someone_watches: bool = False
+    ) -> dict[str, Any]:
         """
         :param action: what the novice proposed, if there is one
         :param info: of the step
         :param action_space: of the environment
+        :param someone_watches: whether a human may take over, if ``info`` itself does not tell
         :return: what a dataset holds of the step besides what Minari asks for
         """
         report = read_report(info, action_space)
+        has_novice = report.says_so or someone_watches
+        cost, is_success = number_in(info, "cost", 0), info.get("is_success")
         return {
-            TAKEOVER: report.takeover or not report.says_so,
-            **({NOVICE_ACTION: np.array(action)} if report.says_so else {}),
-            **{key: kind(info[key]) for key, kind in (("cost", float), ("is_success", bool)) if key in info},
+            TAKEOVER: report.takeover or not has_novice,
+            **({NOVICE_ACTION: np.array(action)} if has_novice else {}),
+            **({} if cost is None else {"cost": cost}),
+            **({} if is_success is None else {"is_success": bool(is_success)}),
         }
 
 
