@@ -1,5 +1,6 @@
 """What RL-Zoo3's experiments do besides with our algorithms and environments: see the function of each method."""
 
+import atexit
 import contextlib
 import functools
 import inspect
@@ -120,10 +121,18 @@ def create_envs(original: Callable[..., Any], manager: Any, *args: Any, **kwargs
         return original(*args, **kwargs)
     before = {number: signal.signal(number, signal.SIG_IGN) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
-        return original(*args, **kwargs)
+        env = original(*args, **kwargs)
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+    atexit.register(end_processes, env.unwrapped)
+    return env
+
+
+def end_processes(env: SubprocVecEnv) -> None:
+    """RL-Zoo3 leaves environments open, and multiprocessing would wait for ever for processes that ignore SIGTERM."""
+    for process in env.processes:
+        process.kill()
 
 
 def preprocess_hyperparams(original: Callable[..., Any], manager: Any, hyperparams: dict[str, Any]) -> Any:
