@@ -74,7 +74,9 @@ def find_training(run_folder: Path) -> tuple[list[str], Path]:
             "of sb3_chac: it holds no <environment>/argv.json."
         )
     try:
-        command = [str(argument) for argument in json.loads(files[0].read_text())]
+        command = json.loads(files[0].read_text())
+        if not isinstance(command, list) or not command or not all(isinstance(argument, str) for argument in command):
+            raise ValueError(f"it must hold the arguments of a command, not {command!r:.60}.")
     except (OSError, ValueError, TypeError) as error:
         raise NotResumable(f"{files[0]} cannot be read: {error}") from error
     checkpoint, problems = sound_checkpoint(run_folder / FOLDER)

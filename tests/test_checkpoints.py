@@ -7,7 +7,7 @@ import shutil
 import signal
 import subprocess
 import sys
-import warnings
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +17,7 @@ from guided_toys import make_guided
 from shell import FOREVER, wait_until
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.callbacks import ConvertCallback
+from stable_baselines3.common.vec_env import VecNormalize
 from test_zoo import swings
 
 import sb3_chac
@@ -41,9 +42,10 @@ SMALL = {"policy_kwargs": {"net_arch": [8]}, "buffer_size": 200}
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory) -> Path:
-    """A folder with the checkpoints 30 and 40 of a short training."""
+    """A folder with the checkpoints 30 and 40 of a short training with VecNormalize."""
     folder = tmp_path_factory.mktemp("run")
     model = make_guided(DPVP)
+    model.set_env(VecNormalize(model.get_env()), force_reset=True)
     model.learn(40, callback=ResumableCheckpoint(10, folder, "toy"))
     return folder
 
@@ -81,17 +83,61 @@ def other_step(path: Path) -> None:
     path.write_text(json.dumps(json.loads(path.read_text()) | {"steps": 41}))
 
 
+def without_policy(path: Path) -> None:
+    """A sound zip, but not a whole model."""
+    rewrite(path, {"policy.pth": None})
+
+
+def with_a_pickle(path: Path) -> None:
+    """A sound zip, whose weights are none."""
+    rewrite(path, {"policy.pth": b"cos\nsystem\n(S'touch ran'\ntR."})
+
+
+def rewrite(path: Path, changes: dict[str, bytes | None]) -> None:
+    with zipfile.ZipFile(path) as archive:
+        entries = {name: archive.read(name) for name in archive.namelist()} | changes
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, content in entries.items():
+            if content is not None:
+                archive.writestr(name, content)
+
+
 @pytest.mark.parametrize("harm", [cut, change, Path.unlink, poison])
-@pytest.mark.parametrize("file", ["toy.zip", BUFFER, CONTENTS])
+@pytest.mark.parametrize("file", ["toy.zip", BUFFER, CONTENTS, "toy/vecnormalize.pkl"])
 def test_damage_is_noticed_and_the_older_one_is_used(folder, file, harm):
     if harm is poison and file != "toy.zip":
         harm = change
     if file == CONTENTS:
         harm = other_step
     harm(folder / "40" / file)
-    if file == "toy.zip" and harm is Path.unlink:  # then it is none
-        assert sound_checkpoint(folder) == (folder / "30", [])
-        return
+    assert_unsound(folder)
+
+
+@pytest.mark.parametrize("harm", [without_policy, with_a_pickle])
+@pytest.mark.parametrize("version", ["this", "without a list of files"])
+def test_a_sound_archive_that_holds_no_model_is_damage(folder, harm, version):
+    harm(folder / "40" / "toy.zip")
+    if version != "this" and harm is with_a_pickle:
+        contents = json.loads((folder / "40" / CONTENTS).read_text())
+        del contents["files"]
+        (folder / "40" / CONTENTS).write_text(json.dumps(contents))
+    assert_unsound(folder)
+
+
+@pytest.mark.parametrize("text", ["[]", "null", "{", "[" * 100_000], ids=["list", "null", "cut", "deep"])
+def test_a_list_of_contents_that_is_none_is_damage(folder, text):
+    (folder / "40" / CONTENTS).write_text(text)
+    assert_unsound(folder)
+
+
+@pytest.mark.parametrize("name", ["99", "0099"])
+def test_a_copy_under_a_higher_number_is_not_of_that_step(folder, name):
+    shutil.copytree(folder / "40", folder / name)
+    path, problems = sound_checkpoint(folder)
+    assert path == folder / "40" and len(problems) == 1 and "is of step 40, not of" in problems[0]
+
+
+def assert_unsound(folder: Path) -> None:
     with pytest.raises(DamagedCheckpoint, match="40"):
         verify(folder / "40")
     path, problems = sound_checkpoint(folder)
@@ -168,10 +214,8 @@ def test_a_model_that_is_no_longer_finite_does_not_replace_one_that_was(tmp_path
             local["self"].policy.predict = lambda *args, **kwargs: (np.zeros((1, 1), np.float32), None)
         return True
 
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
+    with pytest.raises(ValueError, match="NaN or infinite at step 20: no checkpoint was written"):
         model.learn(25, callback=[ResumableCheckpoint(10, tmp_path, "toy"), ConvertCallback(ruin)])
-    assert any("NaN or infinite" in str(warning.message) for warning in caught)
     assert newest_checkpoint(tmp_path / "checkpoints").name == "10"
 
 

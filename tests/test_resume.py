@@ -194,8 +194,9 @@ def test_what_cannot_be_resumed(killed, tmp_path, monkeypatch, capsys):
         (path / "replay_buffer.pkl").unlink()
     output = refused(early)
     assert "holds no checkpoint that is sound" in output and "replay_buffer.pkl is missing" in output
-    (early / "SafeDrive-v0" / "argv.json").write_text("[")
-    assert "cannot be read" in refused(early)
+    for text in ("[", "3", "null", "[]", '"text"', '{"--algo": "chac"}', '[["--algo"], null]'):
+        (early / "SafeDrive-v0" / "argv.json").write_text(text)
+        assert "cannot be read" in refused(early)
 
 
 def test_a_damaged_checkpoint_costs_what_is_said(killed, tmp_path, monkeypatch, capsys):

@@ -3,6 +3,7 @@
 import io
 import json
 import os
+import pickle
 import shutil
 import signal
 import threading
@@ -180,6 +181,8 @@ class ResumableCheckpoint(BaseCallback):
         if normalize is not None:
             (folder / self.env_name).mkdir()
             normalize.save(str(folder / self.env_name / "vecnormalize.pkl"))
+        others = sorted(path for path in folder.rglob("*") if path.is_file() and path.name != BUFFER)
+        contents["files"] = {path.relative_to(folder).as_posix(): checksum(path)[0] for path in others}
         (folder / CONTENTS).write_text(json.dumps(contents) + "\n")
         for path in [*folder.rglob("*"), folder]:
             sync(path)
@@ -234,11 +237,12 @@ def sync(path: Path) -> None:
 def checkpoints(folder: Path) -> list[Path]:
     """
     :param folder: of a ``ResumableCheckpoint``
-    :return: those in it that got their name, which is a number, the newest first; those without a model are none
+    :return: those in it that got their name, which is a number, the newest first; a folder with nothing of one is none
     """
     if not folder.is_dir():
         return []
-    named = (path for path in folder.iterdir() if is_number(path.name) and any(path.glob("*.zip")))
+    named = [path for path in folder.iterdir() if is_number(path.name)]
+    named = [path for path in named if any(path.glob("*.zip")) or (path / CONTENTS).is_file()]
     return sorted(named, key=lambda path: int(path.name), reverse=True)
 
 
@@ -278,16 +282,19 @@ def verify(folder: Path) -> None:
     """
     try:
         written = json.loads((folder / CONTENTS).read_text()) if (folder / CONTENTS).exists() else {}
+        for name, crc in written.get("files", {}).items():
+            if checksum(folder / name)[0] != crc:
+                raise DamagedCheckpoint(f"{folder / name} is damaged: it is not what was written.")
         models = list(folder.glob("*.zip"))
         if len(models) != 1 or written.get("model", models[0].name) != models[0].name:
             raise DamagedCheckpoint(f"{folder} does not hold one model, but {len(models)}.")
         data = verify_model(models[0])
-        if written and written["steps"] != data.get("num_timesteps"):
-            raise DamagedCheckpoint(f"{models[0]} is of step {data.get('num_timesteps')}, not of {written['steps']}.")
+        if written and not written["steps"] == data.get("num_timesteps") == int(folder.stem):  # "300.tmp" is of step 300, too
+            raise DamagedCheckpoint(f"{models[0]} is of step {data.get('num_timesteps')}, not of {folder.stem}.")
         # Without a list of contents (older versions), the model says whether it has a buffer
         if "buffer_crc" in written or (not written and data.get("buffer_size") is not None):
             verify_buffer(folder / BUFFER, written)
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         if isinstance(error, DamagedCheckpoint):
             raise
         raise DamagedCheckpoint(f"{folder} cannot be read: {error}") from error
@@ -311,8 +318,8 @@ def verify_model(model: Path) -> dict[str, Any]:
                     if not is_finite(values):
                         raise DamagedCheckpoint(f"{model}: {name} holds numbers that are NaN or infinite.")
             return dict(json.loads(archive.read("data")))
-    except (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, NotImplementedError) as error:
-        raise DamagedCheckpoint(f"{model} is damaged: {error}") from error
+    except (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, NotImplementedError, pickle.UnpicklingError) as error:
+        raise DamagedCheckpoint(f"{model} is damaged: {str(error).partition('. ')[0]}") from error
 
 
 def is_finite(values: Any) -> bool:
@@ -333,13 +340,21 @@ def verify_buffer(path: Path, written: dict[str, Any]) -> None:
     """
     if not path.is_file():
         raise DamagedCheckpoint(f"{path} is missing: the training would go on with empty stores.")
+    crc, last = checksum(path)
+    size = path.stat().st_size
+    if last != b"." or (written and (size, crc) != (written["buffer_bytes"], written["buffer_crc"])):
+        raise DamagedCheckpoint(f"{path} is damaged: its {size} bytes are not those that were written.")
+
+
+def checksum(path: Path) -> tuple[int, bytes]:
+    """
+    :return: that of a file, and its last byte
+    """
     crc, last = 0, b""
     with path.open("rb") as file:
         while block := file.read(2**22):
             crc, last = zlib.crc32(block, crc), block[-1:]
-    size = path.stat().st_size
-    if last != b"." or (written and (size, crc) != (written["buffer_bytes"], written["buffer_crc"])):
-        raise DamagedCheckpoint(f"{path} is damaged: its {size} bytes are not those that were written.")
+    return crc, last
 
 
 def stored_rows(folder: Path) -> int | None:
