@@ -383,7 +383,7 @@ def test_dataset_that_is_missing_or_does_not_fit(algorithm, tmp_path, monkeypatc
         algorithm("MlpPolicy", Board(), "toy/nothing-v0")
     with pytest.raises(DatasetError, match=r"observation space differs in shape: \(3,\) instead of \(2,\)"):
         small(algorithm, env=gym.make("MountainCarContinuous-v0"))
-    with pytest.raises(ValueError, match="dataset must be text"):
+    with pytest.raises(DatasetError, match="dataset: must be the id or folder of a dataset"):
         small(algorithm, dataset=7)
 
 
