@@ -17,7 +17,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_chac.common import pictures
-from sb3_chac.common.episodes import NotEvaluable, Runner, Task, make_env, registered_spec
+from sb3_chac.common.episodes import NotEvaluable, Runner, Task, check_names_no_code, make_env, registered_spec
 from sb3_chac.common.evaluation import saved_model
 from sb3_chac.evaluate import DEFAULT_ENV, check_output, find_algorithm, find_normalization, load_model, parse_env_kwargs
 from sb3_chac.human.dataset_writer import SETTINGS
@@ -267,6 +267,7 @@ class Replay(Runner):
         self.observations: list[np.ndarray] = []
         self.rewards: list[float] = []
         spec = registered_spec(spec, f"dataset {dataset.id}")
+        check_names_no_code(self.metadata.get("options"), spec, f"dataset {dataset.id}")
         super().__init__(Task(lambda observation: None, spec, {}), render_mode)
 
     def __enter__(self) -> "Replay":

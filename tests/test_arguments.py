@@ -1,5 +1,6 @@
 """Arguments of constructors: what one cannot be gives one error that begins with its name, before anything is built."""
 
+import fractions
 import inspect
 import math
 import typing
@@ -49,7 +50,7 @@ GOOD = {
         *("lagrange_start", "lagrange_init", "lagrange_max", "pid_kp", "pid_ki", "pid_kd", "pid_tau", "warm_up_steps"),
         *("n_rounds", "target_policy_noise", "target_noise_clip", "budget", "delay", "smoothing", "threshold"),
         *("start_scenario", "traffic_density", "obstacle_density", "displacement_reward", "speed_reward", "gradient_steps"),
-        *("collision_penalty", "arrival_reward", "out_of_road_penalty"),
+        *("cost_coef", "collision_penalty", "arrival_reward", "out_of_road_penalty"),
     },
     "text": {"tensorboard_log", "dataset"},  # a folder; what is not there is told when it is read
 }
@@ -100,6 +101,35 @@ def test_what_an_argument_cannot_be_is_named(owner):
     assert not silent and not unnamed, f"of {tried}, taken: {silent}; without a name: {unnamed}"
 
 
+OTHERS = {
+    "400 digits": 10**400,
+    "fraction": fractions.Fraction(1, 2),
+    "complex": 1j,
+    "float32 NaN": np.float32("nan"),
+}
+
+
+@pytest.mark.parametrize("value", OTHERS.values(), ids=OTHERS)
+@pytest.mark.parametrize("owner", OWNERS.values(), ids=OWNERS)
+def test_numbers_that_are_none_of_ours_are_named(owner, value):
+    hints, others, tried = annotations(owner.__init__), required(owner), 0
+    for name in inspect.signature(owner).parameters:
+        if name in NOT_CHECKED or hints.get(name) is typing.Any or fits(value, hints.get(name)):
+            continue
+        tried += 1
+        with pytest.raises(ValueError, match=name):
+            owner(**{**others, name: value})
+    assert tried >= 2
+
+
+@pytest.mark.parametrize("name", ["policy", "replay_buffer_class", "rollout_buffer_class"])
+@pytest.mark.parametrize("algorithm", [getattr(sb3_chac, name) for name in ALGORITHMS.values()])
+def test_a_class_of_another_kind_is_named(algorithm, name):
+    if name in inspect.signature(algorithm).parameters:
+        with pytest.raises(ValueError, match=f"^{name} must be .*class"):
+            algorithm(**{**required(algorithm), name: int})
+
+
 @pytest.mark.parametrize("owner", OWNERS.values(), ids=OWNERS)
 def test_what_signatures_say_is_what_the_defaults_are(owner):
     hints = annotations(owner.__init__)
@@ -109,7 +139,16 @@ def test_what_signatures_say_is_what_the_defaults_are(owner):
 
 
 @pytest.mark.parametrize(
-    "schedule, is_good", [(lambda left: 0.2 * left, True), (lambda left: math.nan, False), (lambda left: -left, False)]
+    "schedule, is_good",
+    [
+        (lambda left: 0.2 * left, True),
+        (lambda left: math.nan, False),
+        (lambda left: -left, False),
+        (lambda left: 1 / 0, False),
+        (lambda left: "quick", False),
+        (lambda left: None, False),
+        (lambda: 0.1, False),
+    ],
 )
 @pytest.mark.parametrize("name", ["clip_range", "clip_range_vf", "learning_rate"])
 @pytest.mark.parametrize("algorithm", [sb3_chac.PPOLag, sb3_chac.GAIL])

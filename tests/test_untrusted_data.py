@@ -4,16 +4,19 @@ import json
 import os
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.envs.classic_control import PendulumEnv
 from gymnasium.envs.registration import EnvSpec
 
 from sb3_chac.cockpit.recording import ABOUT, FOLDER, Recorder, finish_recording
-from sb3_chac.common.episodes import NotEvaluable, registered_spec
+from sb3_chac.common.episodes import NotEvaluable, check_names_no_code, registered_spec
 from sb3_chac.demos import main as demos
+from sb3_chac.human.demonstrations import open_dataset
 from sb3_chac.human.recording import record
 
 ROOT = Path(__file__).parents[1]
@@ -66,6 +69,60 @@ def test_a_drive_is_recovered_without_making_its_environment(tmp_path, no_code, 
     file.write_text(json.dumps(about | {"spec": changed(about["spec"], harm)}))
     summary = finish_recording(tmp_path)
     assert summary is not None and summary.steps == 1
+
+
+class Importing(PendulumEnv):
+    """As highway-env does, it imports what its keywords and the options of a reset name."""
+
+    def __init__(self, render_mode=None, config=None):
+        super().__init__(render_mode)
+        self.configure(config or {})
+
+    def configure(self, config):
+        for part in config.values():
+            import_module(part["type"] if isinstance(part, dict) else part[0])
+
+    def reset(self, *, seed=None, options=None):
+        self.configure(options or {})
+        return super().reset(seed=seed)
+
+
+@pytest.mark.parametrize("config", [{"a": {"type": "evil.module"}}, {"a": ["evil.module"]}, {"a": ["antigravity:fly", 1]}])
+@pytest.mark.parametrize("place", ["keywords", "options"])
+def test_what_a_file_gives_to_an_environment_names_no_code(tmp_path, no_code, monkeypatch, capsys, config, place):
+    monkeypatch.setitem(
+        gym.registry, "Importing-v0", EnvSpec("Importing-v0", entry_point=f"{__name__}:Importing", max_episode_steps=5)
+    )
+    (tmp_path / "evil").mkdir()
+    (tmp_path / "evil" / "module.py").write_text("open('ran', 'w')")
+    monkeypatch.syspath_prepend(tmp_path)
+    folder = record(tmp_path / "set-v0", lambda observation: np.zeros(1, np.float32), "Importing-v0", 5)
+    if place == "keywords":
+        file = next(folder.rglob("metadata.json"))
+        metadata = json.loads(file.read_text())
+        metadata["env_spec"] = changed(metadata["env_spec"], {"kwargs": {"config": config}})
+        file.write_text(json.dumps(metadata))
+    else:
+        storage = type(open_dataset(folder).storage)
+        original = storage.get_episode_metadata
+
+        def with_options(self, episodes):
+            return [found | {"options": config} for found in original(self, episodes)]
+
+        monkeypatch.setattr(storage, "get_episode_metadata", with_options)
+    with pytest.raises(SystemExit) as ended:
+        demos(["replay", "--dataset", str(folder)])
+    error = capsys.readouterr().err
+    assert ended.value.code == 2 and error.count("\n") == 1 and "may be code that it imports" in error
+    assert not (tmp_path / "ran").exists()
+
+
+def test_keywords_of_the_package_itself_or_registered_with_it_are_fine():
+    own, registered = {"config": {"vehicle": "gymnasium.envs.Some"}}, {"xml_file": "mine.xml"}
+    known = EnvSpec("Known-v0", entry_point="gymnasium.envs:Env", kwargs=registered)
+    check_names_no_code({**own, "text": "SXO 0.5 1e3", 3: [None, 1.5, True]}, known, "a file")
+    with pytest.raises(NotEvaluable, match=r"^a file: Known-v0 is to get 'os.system'"):
+        check_names_no_code({"os.system": 1}, known, "a file")
 
 
 def test_a_registered_environment_keeps_the_keywords_of_the_file():

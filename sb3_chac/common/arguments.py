@@ -96,20 +96,34 @@ def check_argument(name: str, value: Any, hint: Any) -> None:
     :raises ValueError: unless they fit, and numbers are finite and within ``RANGES``
     """
     if not fits(value, hint):
-        raise ValueError(f"{name} must be {describe(hint)}, got {value!r}.")
+        raise ValueError(f"{name} must be {describe(hint)}, got {value!r:.80}.")
     limits = RANGES.get(name)
     for number in numbers_in(value):
         if limits is not None and number not in limits:
             kind = "a finite number" if fits(0.5, hint) else "an integer"
             raise ValueError(f"{name} must be {kind} {limits}, got {value!r}.")
     if name in SCHEDULES and callable(value):
-        start, end = float(value(1.0)), float(value(0.0))
+        start, end = ends_of_schedule(name, value)
         if start not in RANGES[name] or not 0 <= end < math.inf:
             raise ValueError(f"{name} must be a schedule of numbers {RANGES[name]}, got one from {start} to {end}.")
     if name == "sde_sample_freq" and value != -1 and value < 1:
         raise ValueError(f"sde_sample_freq must be an integer of at least 1, or -1 (once a rollout), got {value!r}.")
     if name == "train_freq" and isinstance(value, tuple) and value[1] not in ("step", "episode"):
         raise ValueError(f"train_freq must count in 'step' or 'episode', got {value!r}.")
+
+
+def ends_of_schedule(name: str, schedule: Callable[[float], Any]) -> tuple[float, float]:
+    """
+    :param name: of the argument
+    :param schedule: of the remaining progress
+    :return: its values at the start and at the end
+    :raises ValueError: if it fails, or they are no numbers
+    """
+    try:
+        return float(schedule(1.0)), float(schedule(0.0))
+    except Exception as error:  # it is the user's
+        problem = f"{type(error).__name__}: {error}"
+        raise ValueError(f"{name} must be a schedule of numbers, but it raised {problem}.") from error
 
 
 def check_name(owner: type, name: str, value: Any) -> None:
@@ -154,21 +168,28 @@ def fits(value: Any, hint: Any) -> bool:
     if hint is bool:
         return isinstance(value, bool | np.bool_)
     if hint is int:
-        return isinstance(value, numbers.Integral) and not isinstance(value, bool)
+        return isinstance(value, numbers.Integral) and not isinstance(value, bool) and abs(value) < 2**63
     if hint is float:
-        return isinstance(value, numbers.Real) and not isinstance(value, bool) and math.isfinite(value)
+        return isinstance(value, int | float | np.number) and not isinstance(value, bool) and is_finite_number(value)
     if hint is str:
         return isinstance(value, str | os.PathLike)
     if origin is tuple:
         return isinstance(value, tuple) and len(value) == len(parts) and all(map(fits, value, parts))
     if origin is type:
-        return isinstance(value, type)
+        return isinstance(value, type) and (not isinstance(parts[0], type) or issubclass(value, parts[0]))
     if origin is collections.abc.Callable:
         return callable(value)
     kind = origin or hint
     if not isinstance(kind, type) or getattr(kind, "_is_protocol", False):
         return True
     return isinstance(value, kind)
+
+
+def is_finite_number(value: Any) -> bool:
+    try:
+        return math.isfinite(value)
+    except (OverflowError, TypeError):  # an int of hundreds of digits, a complex number
+        return False
 
 
 WORDS = {int: "an integer", float: "a finite number", bool: "True or False", str: "text", dict: "a dict", type(None): "None"}
@@ -185,7 +206,7 @@ def describe(hint: Any) -> str:
     if hint in WORDS:
         return WORDS[hint]
     if origin is type:
-        return "a class"
+        return f"a subclass of {parts[0].__name__}" if isinstance(parts[0], type) else "a class"
     if origin is tuple:
         return f"a tuple ({', '.join(map(describe, parts))})"
     if origin is collections.abc.Callable:

@@ -8,6 +8,8 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_chac.common.arguments import ends_of_schedule, is_finite_number
+
 FLOAT32_MAX = float(np.finfo(np.float32).max)
 
 
@@ -58,7 +60,7 @@ def check_range(name: str, value: Any, low: float = -math.inf, high: float = mat
     :param exclusive_low: whether ``low`` itself is refused
     :raises ValueError: unless ``value`` is a finite number between ``low`` and ``high``
     """
-    is_number = isinstance(value, int | float | np.number) and not isinstance(value, bool) and math.isfinite(value)
+    is_number = isinstance(value, int | float | np.number) and not isinstance(value, bool) and is_finite_number(value)
     if not is_number or not low <= value <= high or (exclusive_low and value == low):
         left = "above" if exclusive_low else "of at least"
         limits = f"{left} {low:g}" + (f" and at most {high:g}" if math.isfinite(high) else "")
@@ -80,7 +82,7 @@ def check_learning_rate(name: str, value: float | Callable[[float], float]) -> N
     :param value: a number, or a schedule of the remaining progress (1 to 0)
     :raises ValueError: if it is negative or not finite, at the start or at the end of a schedule
     """
-    for rate in [value(1.0), value(0.0)] if callable(value) else [value]:
+    for rate in ends_of_schedule(name, value) if callable(value) else (value,):
         try:
             check_range(name, rate, low=0.0)
         except ValueError as error:

@@ -3,6 +3,7 @@
 import copy
 import io
 import math
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -62,7 +63,7 @@ def registered_spec(spec: EnvSpec, source: str) -> EnvSpec:
     :param spec: as read from a file
     :param source: the file, for the message
     :return: the registered specification, with the file's keywords and time limit
-    :raises NotEvaluable: if no such environment is registered, or it stands in wrappers
+    :raises NotEvaluable: if no such environment is registered, it stands in wrappers, or a keyword may name code
     """
     known = gym.registry.get(spec.id)
     if known is None:
@@ -73,7 +74,34 @@ def registered_spec(spec: EnvSpec, source: str) -> EnvSpec:
     if spec.additional_wrappers:
         names = ", ".join(wrapper.name for wrapper in spec.additional_wrappers)
         raise NotEvaluable(f"{source}: {spec.id} stands in wrappers ({names}), which are not imported from a file.")
+    check_names_no_code({key: value for key, value in spec.kwargs.items() if value != known.kwargs.get(key)}, known, source)
     return replace(known, kwargs={**known.kwargs, **spec.kwargs}, max_episode_steps=spec.max_episode_steps)
+
+
+# What an environment may import from: names joined by points or colons
+PATH_OF_CODE = re.compile(r"[^\W\d]\w*(?:\s*[.:]+\s*[^\W\d]\w*)+")
+
+
+def check_names_no_code(value: Any, known: EnvSpec, source: str) -> None:
+    """
+    :param value: that a file gives to an environment: keywords, or options of a reset
+    :param known: the registered specification; its own package may be named
+    :param source: the file, for the message
+    :raises NotEvaluable: if a text in it looks like a class or function of another package
+    """
+    parts = [*value, *value.values()] if isinstance(value, dict) else value if isinstance(value, list | tuple) else []
+    for part in parts:
+        check_names_no_code(part, known, source)
+    entry = known.entry_point
+    module = entry.partition(":")[0] if isinstance(entry, str) else getattr(entry, "__module__", "")
+    own = module.partition(".")[0]
+    found = PATH_OF_CODE.findall(value) if isinstance(value, str) else []
+    strange = next((path for path in found if re.split(r"\W", path)[0] != own), None)
+    if strange is not None:
+        raise NotEvaluable(
+            f"{source}: {known.id} is to get {strange!r}, which may be code that it imports. If you trust it, register the "
+            "environment with this keyword yourself."
+        )
 
 
 class SavedModel(NamedTuple):
