@@ -341,7 +341,7 @@ class SafeDriveEnv(gym.Env, TakeoverDisplay):
             "out_of_road": self.out_of_road,
             "arrive_dest": self.arrived,
             "is_success": self.arrived,
-            "route_completion": min(max(self.s / (self.map.length - ARRIVES_BEFORE_END), 0.0), 1.0),
+            "route_completion": float(min(max(self.s / (self.map.length - ARRIVES_BEFORE_END), 0.0), 1.0)),
             "speed": self.ego.speed,
             "episode_cost": float(self.episode_cost),
             "scenario": self.scenario,
