@@ -115,7 +115,7 @@ def test_lists_that_do_not_do(folder):
         load_demonstrations(nothing)
 
 
-@pytest.mark.parametrize("version", ["0.4.3", "9.0.0"])
+@pytest.mark.parametrize("version", ["0.3.1", "9.0.0"])
 def test_other_versions_are_named(version, folder, tmp_path):
     shutil.copytree(folder, tmp_path / "old-v0")
     path = tmp_path / "old-v0" / "data" / "metadata.json"

@@ -427,7 +427,8 @@ def test_logs(algorithm, tmp_path):
 def test_missing_costs_are_one_error_and_nothing_is_lost(algorithm, cost, got, step, tmp_path):
     env = bills(dict(costs=[1.0] * 100, length=50), dict(costs=[1.0] * step + [cost], length=50))
     model = make_model(algorithm, env)
-    message = rf"info\['cost'\] of environment 1 must be a finite number at every step, got {got}: .*wrap this one"
+    remedy = "wrap this one" if cost is None else "mend the environment"
+    message = rf"info\['cost'\] of environment 1 must be a finite number at every step, got {got}: .*{remedy}"
     with pytest.raises(ValueError, match=message):
         model.learn(100)
     buffer = model.replay_buffer if algorithm is SACLag else model.rollout_buffer
