@@ -168,7 +168,7 @@ def fits(value: Any, hint: Any) -> bool:
     if hint is bool:
         return isinstance(value, bool | np.bool_)
     if hint is int:
-        return isinstance(value, numbers.Integral) and not isinstance(value, bool) and abs(value) < 2**63
+        return isinstance(value, numbers.Integral) and not isinstance(value, bool) and abs(int(value)) < 2**63
     if hint is float:
         return isinstance(value, int | float | np.number) and not isinstance(value, bool) and is_finite_number(value)
     if hint is str:
