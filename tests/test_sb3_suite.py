@@ -44,7 +44,9 @@ def suite(tmp_path_factory) -> Path:
 def test_sb3s_own_tests_of_sac(suite, algorithm):
     command = [sys.executable, "-m", "pytest", "-q", "-p", "sb3_suite_plugin", "-k", SELECT[algorithm], "tests"]
     command += [f"--ignore={name}" for name in LEFT_OUT]
-    env = {**os.environ, "PYTHONPATH": str(Path(__file__).parent), "SB3_SUITE_ALGORITHM": algorithm}
+    here = Path(__file__).parent
+    paths = os.pathsep.join(map(str, [here, here.parent]))  # the algorithms of this checkout, wherever the installation points
+    env = {**os.environ, "PYTHONPATH": paths, "SB3_SUITE_ALGORITHM": algorithm}
     completed = subprocess.run(command, cwd=suite, env=env, capture_output=True, text=True)
     assert completed.returncode == 0, completed.stdout[-5000:]
     passed = re.search(r"(\d+) passed", completed.stdout)
