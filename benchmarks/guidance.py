@@ -8,8 +8,8 @@
 Hyperparameters are those of ``hyperparams/<algo>.yml``. Training maps 100-119; every evaluation is one deterministic episode
 on each of the maps 1000-1199, without the human. Seeds 0-2 are the reported ones; tuning is done on seeds from 100 and maps
 2000-2199. C-HAC and its ablations share their stage 1. With ``--env MetaDriveSafety-v0``, the same there.
-One CSV per run is written to benchmarks/results/guidance/ (guidance-metadrive/), a row per evaluation as it comes; a run that
-was cut off starts anew. Models go to --models.
+One CSV per run is written to benchmarks/results/guidance/ (guidance-metadrive/), a row per evaluation as it comes. A run of
+stage 2 that was cut off goes on from its last evaluation; others (half an hour at most) start anew. Models go to --models.
 """
 
 import argparse
@@ -18,6 +18,7 @@ import importlib.metadata
 import io
 import json
 import multiprocessing
+import shutil
 import time
 import zipfile
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -112,6 +113,7 @@ class Record(BaseCallback):
         self.env_id, self.versions = env_id, versions(env_id)
         self.path, self.labels, self.every, self.maps = path, labels, every, maps
         self.training_cost = training_cost
+        self.save_to: Path | None = None  # the model, with its transitions, at each evaluation
 
     def _on_step(self) -> bool:
         self.training_cost += sum(info["cost"] for info in self.locals["infos"])
@@ -128,6 +130,9 @@ class Record(BaseCallback):
                 if is_new:
                     writer.writeheader()
                 writer.writerow(row)
+            if self.save_to is not None:
+                self.model.save(self.save_to)
+                self.model.save_replay_buffer(self.save_to.with_suffix(".pkl"))
         return True
 
 
@@ -136,25 +141,31 @@ def run(
 ) -> str:
     th.set_num_threads(1)
     method = METHODS[name]
-    path = results / f"{name}-{seed}.csv"
-    path.unlink(missing_ok=True)
+    path, end = results / f"{name}-{seed}.csv", models / f"{name}-{seed}.zip"
     for folder in (results, models):
         folder.mkdir(parents=True, exist_ok=True)
     model = make_model(method.algo, seed, env_id, method.budget)
     training_cost = 0.0
-    if method.goes_on_from is not None:
-        start = models / f"{method.goes_on_from}-{seed}.zip"
-        model = type(model).load(start, env=model.get_env(), device="cpu", **method.overrides)
-        model.load_replay_buffer(start.with_suffix(".pkl"))
+    if method.goes_on_from is None:
+        path.unlink(missing_ok=True)
+    else:
+        if not (path.exists() and end.exists()):
+            path.unlink(missing_ok=True)
+            for suffix in (".zip", ".pkl"):
+                shutil.copy((models / f"{method.goes_on_from}-{seed}").with_suffix(suffix), end.with_suffix(suffix))
+        model = type(model).load(end, env=model.get_env(), device="cpu", **method.overrides)
+        model.load_replay_buffer(end.with_suffix(".pkl"))
         training_cost = model.counts["safety_cost"]
     maps = TUNING_MAPS if seed >= FIRST_TUNING_SEED else TEST_MAPS
     record = Record(path, {"method": name, "seed": seed}, env_id, every, maps, training_cost)
+    if method.goes_on_from is not None:
+        record.save_to = end
     model.learn(
         min(method.steps, most_steps) - model.num_timesteps, callback=record, reset_num_timesteps=method.goes_on_from is None
     )
-    model.save(models / f"{name}-{seed}.zip")
+    model.save(end)
     if any(other.goes_on_from == name for other in METHODS.values()):
-        model.save_replay_buffer(models / f"{name}-{seed}.pkl")
+        model.save_replay_buffer(end.with_suffix(".pkl"))
     model.get_env().close()
     return f"{name} seed {seed}: {time.process_time():.0f} CPU seconds"
 
