@@ -36,6 +36,7 @@ from sb3_chac.cockpit.person import NotDrivable, Person, check_drivable
 from sb3_chac.cockpit.recording import FOLDER
 from sb3_chac.cockpit.session import DriveEnded
 from sb3_chac.cockpit.window import Window
+from sb3_chac.common.checkpoints import sound_checkpoint
 from sb3_chac.human.demonstrations import load_demonstrations
 
 
@@ -476,7 +477,8 @@ def test_drive_with_keys_then_resume_and_replay(tmp_path, monkeypatch, capsys):
     second = re.search(r"minari/(drives/pvp-SafeDrive-.*-v0)", capsys.readouterr().out)[1]
     model = PVP.load("logs/pvp/SafeDrive-v0_2/SafeDrive-v0.zip")
     assert model.counts["total_steps"] >= 20 and model.counts["human_steps"] >= 5
-    model.load_replay_buffer(next(iter((tmp_path / "logs/pvp/SafeDrive-v0_2/checkpoints").glob("*/replay_buffer.pkl"))))
+    checkpoint, _ = sound_checkpoint(tmp_path / "logs/pvp/SafeDrive-v0_2/checkpoints")
+    model.load_replay_buffer(checkpoint / "replay_buffer.pkl")
     assert model.replay_buffer.size() == model.counts["total_steps"]
 
     main_with(monkeypatch, "demos", "replay", "--dataset", second)

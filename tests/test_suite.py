@@ -172,7 +172,7 @@ def test_a_killed_suite_goes_on_from_checkpoints_and_takes_its_processes_along(t
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_signal_ends_the_suite_and_its_jobs_in_good_order(tmp_path, number):
-    arguments = command(tmp_path, "run", "--rows", "pvp", "bc", "--seeds", "1", "--scale", "0.02", "--jobs", "1")
+    arguments = command(tmp_path, "run", "--rows", "pvp", "dpvp", "--seeds", "1", "--scale", "0.02", "--jobs", "1")
     process = subprocess.Popen(arguments, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
     folder = tmp_path / "work" / "pvp-0"
     begun = folder / "logs" / "pvp" / "SafeDrive-v0_1" / "progress.csv"
@@ -185,7 +185,7 @@ def test_a_signal_ends_the_suite_and_its_jobs_in_good_order(tmp_path, number):
     )
     assert "Traceback" not in complaints and "Stopped by SIGTERM at step" in (folder / "log.txt").read_text()
     assert sound_checkpoint(begun.parent / "checkpoints")[0] is not None
-    assert not (tmp_path / "work" / "bc-0" / "demonstrations").exists()  # the next one was not begun
+    assert not (tmp_path / "work" / "dpvp-0" / "logs").exists()  # the next one was not begun
 
 
 def test_a_failed_job_does_not_stop_the_others(tmp_path):
