@@ -1,3 +1,4 @@
+import warnings
 from collections import deque
 from typing import Any, ClassVar, TypeVar
 
@@ -9,6 +10,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.sac.policies import Actor
 
 from sb3_chac.chac.policies import CONTROLS, CHACPolicy, CnnPolicy, MlpPolicy, MultiInputPolicy
+from sb3_chac.chac.relapse import RelapseWatch
 from sb3_chac.common.arguments import checked
 from sb3_chac.common.buffers import DualReplayBuffer, DualReplayBufferSamples
 from sb3_chac.common.checks import check_integer, check_range
@@ -56,6 +58,9 @@ class CHAC(DPVP):
     - In stage 1 nothing bad happens, as the human takes over before. So the step of the novice after which the human took
       over counts as a share of an accident (``takeover_cost``; as in RLIF, Luo et al. 2023). Without it Z_c knows the gain of
       driving faster but not the risk, and pi_r alone collides five times as often as pi_g.
+    - Forgetting is noticed: the scores of ``relapse_window`` episodes (the sum of what Z_c learns) are compared with the best
+      before, stage 1 included. If they are worse by more than their noise, a warning says so, ``chac/relapse`` is 1, and
+      unless it is over when ``learn`` ends, the policy is the best one again then (at once with ``return_to_best``).
 
     ``preset`` fills in the arguments that are None, those of ``DPVP`` and:
 
@@ -93,6 +98,8 @@ class CHAC(DPVP):
     :param normalize_rewards: whether Z_c learns rewards in units of their running root mean square
     :param cost_coef: what ``info["cost"]`` counts against (normalised) rewards in Z_c
     :param takeover_cost: safety cost, in Z_c, of a step of the novice after which the human took over
+    :param relapse_window: episodes whose scores are judged together to notice that stage 2 forgets, 0 to judge nothing
+    :param return_to_best: whether the policy is the best one again as soon as stage 2 forgets, not only at the end
     :raises ValueError: for an argument out of its range, an action space that is not a bounded Box, or, while learning,
         an observation or reward that is NaN or infinite
     """
@@ -175,6 +182,8 @@ class CHAC(DPVP):
         normalize_rewards: bool | None = None,
         cost_coef: float | None = None,
         takeover_cost: float | None = None,
+        relapse_window: int = 20,
+        return_to_best: bool = False,
         use_sde: bool = False,
         sde_sample_freq: int = -1,
         use_sde_at_warmup: bool = False,
@@ -245,6 +254,8 @@ class CHAC(DPVP):
         self.normalize_rewards: Any = normalize_rewards
         self.cost_coef: Any = cost_coef
         self.takeover_cost: Any = takeover_cost
+        self.relapse_window = relapse_window
+        self.return_to_best = return_to_best
 
         if _init_setup_model:
             self._setup_model()
@@ -260,6 +271,7 @@ class CHAC(DPVP):
         self.self_average_update = TargetUpdate(self.self_actor, self.policy.averaged_self_actor)
         # Since the logger took them, or the latest: nobody may ever take them
         self.choices: deque[dict[str, np.ndarray]] = deque(maxlen=MOST_CHOICES)
+        self.watch = RelapseWatch(self.relapse_window) if self.relapse_window else None
 
     def _create_aliases(self) -> None:
         super()._create_aliases()
@@ -285,6 +297,9 @@ class CHAC(DPVP):
         check_range("anchor_coef", self.anchor_coef, low=0.0)
         check_range("cost_coef", self.cost_coef, low=0.0)
         check_range("takeover_cost", self.takeover_cost, low=0.0)
+        check_integer("relapse_window", self.relapse_window, low=0)
+        if self.relapse_window == 1:
+            raise ValueError("relapse_window must be 0 or at least 2: one episode does not tell its noise.")
         if self.bootstrap not in ("executed", "self"):
             raise ValueError(f"bootstrap must be 'executed' or 'self', got {self.bootstrap!r}.")
 
@@ -356,9 +371,15 @@ class CHAC(DPVP):
             self.n_reward_updates += 1
             step = max(1e-3, 1 / self.n_reward_updates)
             self.reward_square += step * (rewards.square().mean().item() - self.reward_square)
-            rewards = rewards / max(self.reward_square**0.5, 1e-8)
+        rewards = rewards / self._reward_scale()
         costs = batch.costs + self.takeover_cost * batch.takeovers_follow
         return rewards - self.cost_coef * costs.flatten()
+
+    def _reward_scale(self) -> float:
+        """
+        :return: the unit of the rewards that Z_c learns
+        """
+        return max(self.reward_square**0.5, 1e-8) if self.normalize_rewards else 1.0
 
     @th.no_grad()
     def _shared_return_targets(
@@ -373,6 +394,30 @@ class CHAC(DPVP):
         next_std = th.where(choice.self_drives, choice.std_self, choice.std_guided)
         # The mode of pi_g has no entropy
         return return_targets(rewards, self._discounts(batch), next_q, next_std, ent_coef * log_prob * choice.self_drives)
+
+    def _forget_episodes(self) -> None:
+        super()._forget_episodes()
+        self._episode_scores = np.zeros(self.n_envs)
+
+    def _count(self, infos: list[dict[str, Any]], rewards: np.ndarray, dones: np.ndarray) -> None:
+        super()._count(infos, rewards, dones)
+        if self.watch is None:
+            return
+        costs = [(info["cost"] or 0.0) + self.takeover_cost * info["takeover_start"] for info in infos]
+        self._episode_scores += rewards / self._reward_scale() - self.cost_coef * np.array(costs)
+        for idx in np.flatnonzero(dones):
+            self.watch.add(self._episode_scores[idx])
+            self._episode_scores[idx] = 0.0
+            if self.stage == 2 and self.watch.judge(self.policy):
+                self._on_relapse()
+
+    def _on_relapse(self) -> None:
+        warnings.warn(
+            f"C-HAC: stage 2 has become worse than the best so far (step {self.num_timesteps}). "
+            + ("It goes back to that." if self.return_to_best else "Unless it recovers, that will act when learn() is over.")
+        )
+        if self.return_to_best:
+            self.watch.restore(self.policy)  # type: ignore[union-attr]
 
     def _on_step(self) -> None:
         super()._on_step()
@@ -408,6 +453,8 @@ class CHAC(DPVP):
     def _switch_to_stage_2(self) -> None:
         self._disarm()
         self.policy.start_stage_2()
+        if self.watch is not None:
+            self.watch.begin(self.policy)
         self._show_stage()
         if self.verbose > 0:
             human_steps = int(self.counts["human_steps"])
@@ -448,6 +495,8 @@ class CHAC(DPVP):
 
     def dump_logs(self) -> None:
         self.logger.record("chac/stage", self.stage)
+        if self.stage == 2 and self.watch is not None:
+            self.logger.record("chac/relapse", int(self.watch.relapsed))
         if self.choices:
             means = {name: np.concatenate([choice[name] for choice in self.choices]) for name in self.choices[0]}
             self.choices.clear()
@@ -469,7 +518,10 @@ class CHAC(DPVP):
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
     ) -> SelfCHAC:
-        return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+        super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+        if self.watch is not None and self.watch.relapsed:
+            self.watch.restore(self.policy)
+        return self
 
     def _excluded_save_params(self) -> list[str]:
         networks = ["confidence_critic", "confidence_critic_target", "self_actor", "self_actor_target"]
@@ -480,6 +532,8 @@ class CHAC(DPVP):
             "self_update",
             "self_average_update",
             "choices",
+            "watch",
+            "_episode_scores",
         ]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:

@@ -324,7 +324,8 @@ class DrivenStages(DrivenTraining):
     @property
     def stage_name(self) -> str:
         if self.stage == 2:  # type: ignore[attr-defined]
-            return "2: self-learning"
+            watch = self.watch  # type: ignore[attr-defined]
+            return "2: RELAPSE" if watch is not None and watch.relapsed else "2: self-learning"
         return "1: you guide" if self.prefit_left is None else "1: prepares 2"
 
 

@@ -62,6 +62,9 @@ class GuidedProgressBar(ProgressBarCallback):
         parts.append(f"human {100 * rate:.0f} % ({counts['human_steps']:.0f} steps)")
         if "safety_cost" in self.model.measured:
             parts.append(f"cost {counts['safety_cost']:g}")
+        watch = getattr(self.model, "watch", None)
+        if watch is not None and watch.relapsed:
+            parts.append("RELAPSE")
         return ", ".join(parts)
 
 

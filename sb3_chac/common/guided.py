@@ -296,7 +296,7 @@ class GuidedOffPolicyAlgorithm(CheckedOffPolicyAlgorithm):
         super()._store_transition(replay_buffer, executed, new_obs, reward, dones, marked)
         self.human_driving = np.array([report.takeover for report in reports]) & ~dones.astype(bool)
         self._human_was_seen |= any(report.says_so for report in reports)
-        self._count(marked, dones)
+        self._count(marked, reward, dones)
 
     def _check_received(self, idx: int, info: dict[str, Any], sent: np.ndarray) -> None:
         """
@@ -311,7 +311,7 @@ class GuidedOffPolicyAlgorithm(CheckedOffPolicyAlgorithm):
         if not np.allclose(received, sent, rtol=0, atol=contract.TOLERANCE * (box.high.astype(float) - box.low).max()):
             raise contract.changed_action(idx, sent, received)
 
-    def _count(self, infos: list[dict[str, Any]], dones: np.ndarray) -> None:
+    def _count(self, infos: list[dict[str, Any]], rewards: np.ndarray, dones: np.ndarray) -> None:
         counts = self.counts
         for idx, (info, done) in enumerate(zip(infos, dones, strict=True)):
             takeover = info["takeover"]
