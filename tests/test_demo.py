@@ -15,7 +15,10 @@ from test_zoo import ZOO
 
 from sb3_chac import CHAC, DPVP
 from sb3_chac.common.callbacks import CSVProgress, GuidedProgressBar
+from sb3_chac.common.episodes import Runner, Task
 from sb3_chac.common.evaluation import evaluate
+from sb3_chac.common.pictures import save_video
+from sb3_chac.envs.safedrive import SafeDriveEnv
 from sb3_chac.evaluate import main as evaluate_command
 from sb3_chac.plot import draw, join
 from sb3_chac.plot import main as plot
@@ -184,6 +187,35 @@ def test_policies_beside_each_other(toy, tmp_path, capsys):
     assert set(result["beside"]) == {"guided", "lazy"}
     assert result["beside"]["guided"]["policy"] == "CHAC (guided)" and result["beside"]["guided"]["success_rate"] == 0.0
     assert result["beside"]["lazy"]["records"] == evaluate("lazy", "toy_env:ToyDrive-v0", "0:3").records
+
+
+@pytest.mark.parametrize("control", ["guided", "self", "shared"])
+def test_a_film_tells_stage_driver_and_confidence(toy, control):
+    model = CHAC.load(toy)
+    model.policy.control = control
+    with Runner(Task(model, "toy_env:ToyDrive-v0", {})) as runner:
+        shown = []
+        runner.episode(0, on_step=lambda: shown.append(dict(runner.driver.hud)))
+    assert {step["stage"] for step in shown} == {2}
+    if control == "shared":
+        assert shown[0] == {"stage": 2}
+        assert all(0 <= float(step["confidence"]) <= 1 for step in shown[1:])
+        assert {step["drives"] for step in shown[1:]} <= {"guided policy", "self-learning policy"}
+    else:
+        driver = {"guided": "guided policy", "self": "self-learning policy"}[control]
+        assert {tuple(step.items()) for step in shown} == {(("stage", 2), ("drives", driver))}
+
+
+def test_a_film_shows_what_the_driver_tells(tmp_path, monkeypatch):
+    """On SafeDrive, whose pictures have a place for it; a driver that tells nothing leaves it empty."""
+    shown = []
+    monkeypatch.setattr(SafeDriveEnv, "render", lambda env: shown.append(env.hud) or np.zeros((4, 4, 3), np.uint8))
+    model = CHAC("MlpPolicy", "SafeDrive-v0", policy_kwargs={"net_arch": [8]}, buffer_size=10)
+    for policy, told in ((model, {"stage": 1, "drives": "guided policy"}), ("scripted", {})):
+        with Runner(Task(policy, "SafeDrive-v0", {"horizon": 3}), render_mode="rgb_array") as runner:
+            save_video(tmp_path / "film.gif", runner, 1000)
+        assert shown == 4 * [told]
+        shown.clear()
 
 
 def test_the_chosen_policy_acts_in_every_process(toy):

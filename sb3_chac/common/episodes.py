@@ -152,6 +152,21 @@ class ModelDriver:
         self.episode_start = np.zeros(1, dtype=bool)
         return action[()]  # a discrete action as a number
 
+    @property
+    def hud(self) -> dict[str, Any]:
+        """Who acted in the last step and why, for a ``TakeoverDisplay``: nothing for models that have no stages."""
+        if not hasattr(self.model, "stage"):
+            return {}
+        control: Any = "guided" if self.model.stage == 1 else self.model.policy.control
+        choice: Any = self.model.policy.last_choice
+        shown = {"stage": self.model.stage}
+        if control == "shared":
+            if choice is None:  # before the first step
+                return shown
+            shown["confidence"] = f"{choice.confidence.item():.2f}"
+            control = "self" if choice.self_drives.item() else "guided"
+        return shown | {"drives": "guided policy" if control == "guided" else "self-learning policy"}
+
 
 class Task(NamedTuple):
     """What a process has to know to run episodes, see ``evaluate``."""

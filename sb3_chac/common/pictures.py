@@ -8,6 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from sb3_chac.common.contract import TakeoverDisplay
 from sb3_chac.common.episodes import DrivenPath, NotEvaluable, Runner
 from sb3_chac.common.evaluation import Evaluation
 
@@ -57,6 +58,8 @@ def save_video(file: Path, runner: Runner, number: int) -> None:
     with imageio.get_writer(file, **options) as writer:  # type: ignore[arg-type]
 
         def film() -> None:
+            if isinstance(runner.env.unwrapped, TakeoverDisplay):
+                runner.env.unwrapped.hud = getattr(runner.driver, "hud", {})
             image = np.asarray(runner.env.render())
             height, width = (size - size % 2 for size in image.shape[:2])  # H.264 needs even numbers
             writer.append_data(image[:height, :width])  # type: ignore[attr-defined]
