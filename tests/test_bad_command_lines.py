@@ -78,7 +78,7 @@ ZOO = [
     ("-params replay_buffer_kwargs:1", "replay_buffer_kwargs"),
     ("-params monitor_kwargs:1", "monitor_kwargs"),
     ("-params delta:3 --algo chac", "delta"),
-    ("-params preset:'nonsense' --algo chac", "preset"),
+    ("-params bootstrap:'nonsense' --algo chac", "bootstrap"),
     ("-params dataset:'nowhere-v0' --algo bc", "nowhere-v0"),
     ("-params cost_limit:-1 --algo sac_lag", "cost_limit"),
     ("-params clip_range:'nonsense' --algo ppo_lag", "clip_range"),

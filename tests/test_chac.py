@@ -1,18 +1,20 @@
 """C-HAC: who acts, when the second stage begins, and what learns in which stage."""
 
-import ast
+import inspect
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+import yaml
 from guided_toys import Limited, column, make_batch, make_guided, parameters, same, scripted, silent, wrapper
 from scipy.stats import norm
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.utils import set_random_seed
 
-from sb3_chac import CHAC, DPVP
+from sb3_chac import CHAC, DPVP, DSAC
 from sb3_chac.common.distributional import probability_of_improvement
+from sb3_chac.zoo.registration import hyperparams_file
 
 OBS = np.random.default_rng(0).normal(size=(40, 2)).astype(np.float32)
 
@@ -511,44 +513,38 @@ def test_delta_can_be_changed_on_loading(tmp_path):
     assert CHAC.load(tmp_path / "model", delta=0.0).policy.delta == 0.0
 
 
-# --- Presets
+# --- The paper read literally
 
 
-def documented(algorithm, preset):
-    """The table in the class docstring, of C-HAC with that of D-PVP."""
-    values = documented(DPVP, preset) if algorithm is CHAC else {}
-    for words in map(str.split, algorithm.__doc__.splitlines()):
-        if len(words) == 3 and words[0] in algorithm.presets["default"]:
-            text = words[{"default": 1, "paper": 2}[preset]]
-            values[words[0]] = None if text == "``tau``" else ast.literal_eval(text)
-    return values
-
-
-@pytest.mark.parametrize("preset", ["default", "paper"])
 @pytest.mark.parametrize("algorithm", [DPVP, CHAC])
-def test_presets_fill_in_what_the_docstring_says(algorithm, preset):
-    model = algorithm("MlpPolicy", Limited(), preset=preset, policy_kwargs=dict(net_arch=[8]), buffer_size=10)
-    expected = documented(algorithm, preset)
-    assert expected.keys() == algorithm.presets["default"].keys()
+def test_the_paper_read_literally(algorithm):
+    model = algorithm("MlpPolicy", Limited(), policy_kwargs=dict(net_arch=[8]), buffer_size=10, **algorithm.PAPER)
+    expected = algorithm.PAPER | {"target_entropy": -16.0}
     assert {name: getattr(model, name) for name in expected} == expected
-    assert model.target_entropy == (-16 if preset == "paper" else -2)
+    assert all(inspect.signature(algorithm).parameters[name].default != value for name, value in algorithm.PAPER.items())
 
 
-@pytest.mark.parametrize("preset", ["default", "paper"])
-@pytest.mark.parametrize("name", [*CHAC.presets["default"], "target_entropy"])
-def test_arguments_win_over_the_preset(name, preset):
-    booleans = {key: [False, True] for key in ("bounded_targets", "normalize_rewards")}
-    others = {"bootstrap": ["self", "executed"], "prefit_steps": [9, 10]} | booleans
-    for value in others.get(name, [0.05, 0.06]):
-        kwargs = {name: value}
-        model = CHAC("MlpPolicy", Limited(), preset=preset, policy_kwargs=dict(net_arch=[8]), buffer_size=10, **kwargs)
-        expected = documented(CHAC, preset) | {"target_entropy": -16 if preset == "paper" else -2} | kwargs
-        assert {each: getattr(model, each) for each in expected} == expected
+@pytest.mark.parametrize("algorithm", [DPVP, CHAC])
+def test_the_yaml_reads_the_paper_as_the_constant_does(algorithm):
+    file = hyperparams_file(algorithm.__name__.lower())
+    for env, params in yaml.safe_load((file.parent / "paper" / file.name).read_text()).items():
+        own = {name: value for name, value in params.items() if name not in ("n_timesteps", "policy", "env_wrapper")}
+        assert own == algorithm.PAPER, env
+
+
+@pytest.mark.parametrize("algorithm", [DSAC, DPVP, CHAC])
+@pytest.mark.parametrize("argument, value", [("auto", -2), ("auto_8", -16), ("auto_0.5", -1), (-3.0, -3)])
+def test_target_entropies(algorithm, argument, value):
+    make = {"policy_kwargs": dict(net_arch=[8]), "buffer_size": 10}
+    assert algorithm("MlpPolicy", Limited(), target_entropy=argument, **make).target_entropy == value
+    for wrong in ("auto_", "auto_x", "8", "auto_-1", float("nan")):
+        with pytest.raises(ValueError, match="target_entropy"):
+            algorithm("MlpPolicy", Limited(), target_entropy=wrong, **make)
 
 
 @pytest.mark.parametrize("tau_c, tau", [(None, 0.25), (0.5, 0.5)])
 def test_z_c_follows_its_target_with_tau_c(tau_c, tau):
-    model = make_chac(preset="paper", ent_coef=0.01, tau=0.25, tau_c=tau_c).learn(30)
+    model = make_chac(tau=0.25, tau_c=tau_c).learn(30)
     before = parameters(model, "confidence_critic_target.")
     model._update_confidence_critic(model._sample_batch(8))
     online, after = parameters(model, "confidence_critic."), parameters(model, "confidence_critic_target.")

@@ -552,7 +552,6 @@ def test_actions_of_any_shape(algorithm):
         ({"replay_buffer_class": ReplayBuffer}, ALGORITHMS),
         ({"target_policy_noise": -0.1}, [PVP]),
         ({"target_noise_clip": -0.1}, [PVP]),
-        ({"preset": "papers"}, [DPVP, CHAC]),
         ({"ent_coef": -1.0}, [DPVP, CHAC]),
         ({"eta_pv": 0.0}, [DPVP, CHAC]),
         ({"delta": 1.5}, [CHAC]),

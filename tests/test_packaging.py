@@ -40,7 +40,7 @@ def test_wheel_and_sdist_carry_what_is_needed(dist):
     with zipfile.ZipFile(next(dist.glob("*.whl"))) as wheel:
         names = set(wheel.namelist())
     expected = {"sb3_chac.pth", "sb3_chac.start", "sb3_chac/py.typed", "sb3_chac/version.txt", "sb3_chac/_startup.py"}
-    expected |= {f"sb3_chac/hyperparams/{path.name}" for path in (ROOT / "hyperparams").glob("*.yml")}
+    expected |= {f"sb3_chac/{path.relative_to(ROOT)}" for path in (ROOT / "hyperparams").rglob("*.yml")}
     expected |= {str(path.relative_to(ROOT)) for path in (ROOT / "sb3_chac").rglob("*.py")}
     assert expected <= names
     assert not [name for name in names if name.startswith(("tests", "benchmarks", "build_hooks"))]

@@ -62,21 +62,7 @@ class CHAC(DPVP):
       before, stage 1 included. If they are worse by more than their noise, a warning says so, ``chac/relapse`` is 1, and
       unless it is over when ``learn`` ends, the policy is the best one again then (at once with ``return_to_best``).
 
-    ``preset`` fills in the arguments that are None, those of ``DPVP`` and:
-
-    ==================  ==========  =======
-    argument            "default"   "paper"
-    ==================  ==========  =======
-    sigma_scale         0.02        1
-    tau_c               0.02        ``tau``
-    prefit_steps        8000        0
-    bootstrap           "executed"  "self"
-    stage2_human_share  0.25        0
-    anchor_coef         15          0
-    normalize_rewards   True        False
-    cost_coef           100         0
-    takeover_cost       0.3         0
-    ==================  ==========  =======
+    ``PAPER`` are the arguments that read the paper literally, see ``DPVP``.
 
     The parameters are those of ``DPVP``, and:
 
@@ -89,7 +75,7 @@ class CHAC(DPVP):
         not asked if None
     :param eta_c: weight of sigma^2 in the loss of Z_c, ``eta`` if None; above 1 it shrinks sigma_c
     :param sigma_scale: factor of sigma_c in the confidence
-    :param tau_c: the soft update coefficient of the target of Z_c
+    :param tau_c: the soft update coefficient of the target of Z_c, ``tau`` if None
     :param prefit_steps: gradient steps of Z_c, on both stores, at the switch
     :param bootstrap: "executed": Z_c evaluates what is executed in stage 2 (shared control); "self": pi_r
     :param stage2_human_share: share of the human's transitions in the batches of stage 2
@@ -104,22 +90,17 @@ class CHAC(DPVP):
         an observation or reward that is NaN or infinite
     """
 
-    presets: ClassVar[dict[str, dict[str, Any]]] = {
-        "default": DPVP.presets["default"]
-        | {
-            "sigma_scale": 0.02,
-            "tau_c": 0.02,
-            "prefit_steps": 8000,
-            "bootstrap": "executed",
-            "stage2_human_share": 0.25,
-            "anchor_coef": 15.0,
-            "normalize_rewards": True,
-            "cost_coef": 100.0,
-            "takeover_cost": 0.3,
-        },
-        "paper": DPVP.presets["paper"]
-        | {"sigma_scale": 1.0, "prefit_steps": 0, "bootstrap": "self", "stage2_human_share": 0.0, "anchor_coef": 0.0}
-        | {"normalize_rewards": False, "cost_coef": 0.0, "takeover_cost": 0.0},
+    PAPER: ClassVar[dict[str, Any]] = DPVP.PAPER | {
+        "sigma_scale": 1.0,
+        "tau_c": None,
+        "prefit_steps": 0,
+        "bootstrap": "self",
+        "stage2_human_share": 0.0,
+        "anchor_coef": 0.0,
+        "normalize_rewards": False,
+        "cost_coef": 0.0,
+        "takeover_cost": 0.0,
+        "relapse_window": 0,
     }
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
         "MlpPolicy": MlpPolicy,
@@ -151,20 +132,19 @@ class CHAC(DPVP):
         replay_buffer_kwargs: dict[str, Any] | None = None,
         optimize_memory_usage: bool = False,
         n_steps: int = 1,
-        ent_coef: str | float | None = None,
+        ent_coef: str | float = 0.01,
         target_update_interval: int = 1,
         target_entropy: str | float = "auto",
         ent_coef_lr: float | Schedule = 3e-4,
         policy_delay: int = 2,
         eta: float = 1.0,
         tau_b: float | None = None,
-        preset: str = "default",
         proxy_value: float = 1.0,
         pv_coef: float = 1.0,
-        pv_min_diff: float | None = None,
-        bounded_targets: bool | None = None,
-        weight_decay: float | None = None,
-        average_tau: float | None = None,
+        pv_min_diff: float = 0.15,
+        bounded_targets: bool = True,
+        weight_decay: float = 3.0,
+        average_tau: float = 5e-4,
         eta_pv: float | None = None,
         takeover_stop_td: bool = False,
         delta: float = 0.15,
@@ -173,15 +153,15 @@ class CHAC(DPVP):
         sigma_threshold: float | None = None,
         log_prob_threshold: float | None = None,
         eta_c: float | None = None,
-        sigma_scale: float | None = None,
-        tau_c: float | None = None,
-        prefit_steps: int | None = None,
-        bootstrap: str | None = None,
-        stage2_human_share: float | None = None,
-        anchor_coef: float | None = None,
-        normalize_rewards: bool | None = None,
-        cost_coef: float | None = None,
-        takeover_cost: float | None = None,
+        sigma_scale: float = 0.02,
+        tau_c: float | None = 0.02,
+        prefit_steps: int = 8000,
+        bootstrap: str = "executed",
+        stage2_human_share: float = 0.25,
+        anchor_coef: float = 15.0,
+        normalize_rewards: bool = True,
+        cost_coef: float = 100.0,
+        takeover_cost: float = 0.3,
         relapse_window: int = 20,
         return_to_best: bool = False,
         use_sde: bool = False,
@@ -218,7 +198,6 @@ class CHAC(DPVP):
             policy_delay=policy_delay,
             eta=eta,
             tau_b=tau_b,
-            preset=preset,
             proxy_value=proxy_value,
             pv_coef=pv_coef,
             pv_min_diff=pv_min_diff,
@@ -244,16 +223,15 @@ class CHAC(DPVP):
         self.sigma_threshold = sigma_threshold
         self.log_prob_threshold = log_prob_threshold
         self.eta_c = eta_c
-        # The preset replaces None
-        self.sigma_scale: Any = sigma_scale
-        self.tau_c: Any = tau_c
-        self.prefit_steps: Any = prefit_steps
-        self.bootstrap: Any = bootstrap
-        self.stage2_human_share: Any = stage2_human_share
-        self.anchor_coef: Any = anchor_coef
-        self.normalize_rewards: Any = normalize_rewards
-        self.cost_coef: Any = cost_coef
-        self.takeover_cost: Any = takeover_cost
+        self.sigma_scale = sigma_scale
+        self.tau_c = tau_c
+        self.prefit_steps = prefit_steps
+        self.bootstrap = bootstrap
+        self.stage2_human_share = stage2_human_share
+        self.anchor_coef = anchor_coef
+        self.normalize_rewards = normalize_rewards
+        self.cost_coef = cost_coef
+        self.takeover_cost = takeover_cost
         self.relapse_window = relapse_window
         self.return_to_best = return_to_best
 
@@ -287,9 +265,9 @@ class CHAC(DPVP):
         for name in ("sigma_threshold", "log_prob_threshold"):
             if getattr(self, name) is not None:
                 check_range(name, getattr(self, name))
-        for name in ("eta_c", "sigma_scale"):
-            if getattr(self, name) is not None:
-                check_range(name, getattr(self, name), low=0.0, exclusive_low=True)
+        if self.eta_c is not None:
+            check_range("eta_c", self.eta_c, low=0.0, exclusive_low=True)
+        check_range("sigma_scale", self.sigma_scale, low=0.0, exclusive_low=True)
         if self.tau_c is not None:
             check_range("tau_c", self.tau_c, low=0.0, high=1.0)
         check_integer("prefit_steps", self.prefit_steps, low=0)

@@ -3,7 +3,6 @@ import pathlib
 import warnings
 from typing import Any, ClassVar, TypeVar
 
-import numpy as np
 import torch as th
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
@@ -41,7 +40,7 @@ class DPVP(GuidedOffPolicyAlgorithm, DSAC):
     - The confidence distribution Z_c, which D-PVP itself has no use for, belongs to ``CHAC``.
     - A transition is stored once: in the human's store if the human drove, in the novice's otherwise.
     - The entropy bonus, which the novice can collect for ever by standing still, must not swamp labels of +-1 (it sums up to
-      gamma alpha H / (1 - gamma)): alpha is fixed at 0.01. ``preset="paper"`` learns it from 1, towards -8 per action.
+      gamma alpha H / (1 - gamma)): alpha is fixed at 0.01. The paper learns it from 1, towards -8 per action.
     - No -B where the novice proposed nearly what the human did (``pv_min_diff``): else both labels fall on one action.
     - Without reward no return lies outside of [-B, B], but what Q believes of unseen actions does, and grows by bootstrapping:
       targets are clipped (``bounded_targets``).
@@ -50,17 +49,8 @@ class DPVP(GuidedOffPolicyAlgorithm, DSAC):
     - The policy differs from one thousand steps to the next. What acts when ``deterministic`` (and, in C-HAC, in stage 2) is
       an average of its parameters over time (``average_tau``).
 
-    ``preset`` fills in the arguments that are None:
-
-    ===============  =========  =======
-    argument         "default"  "paper"
-    ===============  =========  =======
-    ent_coef         0.01       "auto"
-    pv_min_diff      0.15       0
-    bounded_targets  True       False
-    weight_decay     3          0
-    average_tau      0.0005     1
-    ===============  =========  =======
+    ``PAPER`` are the arguments that read the paper literally: ``DPVP("MlpPolicy", env, **DPVP.PAPER)``, or RL-Zoo3's
+    ``--conf-file`` with hyperparams/paper/dpvp.yml.
 
     The parameters are those of ``DSAC``, and:
 
@@ -69,7 +59,6 @@ class DPVP(GuidedOffPolicyAlgorithm, DSAC):
     :param optimize_memory_usage: not supported, must be False
     :param n_steps: number of rewards in a return; it ends early where the driver changes
     :param policy_kwargs: additional arguments to be passed to the policy on creation, see ``DPVPPolicy``
-    :param preset: "default" or "paper", see above
     :param proxy_value: B, the label of the human's actions; minus B is the label of the novice's
     :param pv_coef: weight of the labels
     :param pv_min_diff: no label -B where the root mean square of a_h - a_n, both in [-1, 1], is smaller
@@ -82,21 +71,13 @@ class DPVP(GuidedOffPolicyAlgorithm, DSAC):
         an observation or reward that is NaN or infinite
     """
 
-    presets: ClassVar[dict[str, dict[str, Any]]] = {
-        "default": {
-            "ent_coef": 0.01,
-            "pv_min_diff": 0.15,
-            "bounded_targets": True,
-            "weight_decay": 3.0,
-            "average_tau": 5e-4,
-        },
-        "paper": {
-            "ent_coef": "auto",
-            "pv_min_diff": 0.0,
-            "bounded_targets": False,
-            "weight_decay": 0.0,
-            "average_tau": 1.0,
-        },
+    PAPER: ClassVar[dict[str, Any]] = {
+        "ent_coef": "auto",
+        "target_entropy": "auto_8",
+        "pv_min_diff": 0.0,
+        "bounded_targets": False,
+        "weight_decay": 0.0,
+        "average_tau": 1.0,
     }
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
         "MlpPolicy": MlpPolicy,
@@ -124,20 +105,19 @@ class DPVP(GuidedOffPolicyAlgorithm, DSAC):
         replay_buffer_kwargs: dict[str, Any] | None = None,
         optimize_memory_usage: bool = False,
         n_steps: int = 1,
-        ent_coef: str | float | None = None,
+        ent_coef: str | float = 0.01,
         target_update_interval: int = 1,
         target_entropy: str | float = "auto",
         ent_coef_lr: float | Schedule = 3e-4,
         policy_delay: int = 2,
         eta: float = 1.0,
         tau_b: float | None = None,
-        preset: str = "default",
         proxy_value: float = 1.0,
         pv_coef: float = 1.0,
-        pv_min_diff: float | None = None,
-        bounded_targets: bool | None = None,
-        weight_decay: float | None = None,
-        average_tau: float | None = None,
+        pv_min_diff: float = 0.15,
+        bounded_targets: bool = True,
+        weight_decay: float = 3.0,
+        average_tau: float = 5e-4,
         eta_pv: float | None = None,
         takeover_stop_td: bool = False,
         use_sde: bool = False,
@@ -167,7 +147,7 @@ class DPVP(GuidedOffPolicyAlgorithm, DSAC):
             replay_buffer_kwargs=replay_buffer_kwargs,
             optimize_memory_usage=optimize_memory_usage,
             n_steps=n_steps,
-            ent_coef=ent_coef,  # type: ignore[arg-type]  # the preset replaces None
+            ent_coef=ent_coef,
             target_update_interval=target_update_interval,
             target_entropy=target_entropy,
             ent_coef_lr=ent_coef_lr,
@@ -185,14 +165,12 @@ class DPVP(GuidedOffPolicyAlgorithm, DSAC):
             device=device,
             _init_setup_model=False,
         )
-        self.preset = preset
         self.proxy_value = proxy_value
         self.pv_coef = pv_coef
-        # The preset replaces None
-        self.pv_min_diff: Any = pv_min_diff
-        self.bounded_targets: Any = bounded_targets
-        self.weight_decay: Any = weight_decay
-        self.average_tau: Any = average_tau
+        self.pv_min_diff = pv_min_diff
+        self.bounded_targets = bounded_targets
+        self.weight_decay = weight_decay
+        self.average_tau = average_tau
         self.eta_pv = eta_pv
         self.takeover_stop_td = takeover_stop_td
 
@@ -200,7 +178,6 @@ class DPVP(GuidedOffPolicyAlgorithm, DSAC):
             self._setup_model()
 
     def _setup_model(self) -> None:
-        self._fill_in_preset()
         super()._setup_model()
         self.average_update = TargetUpdate(self.actor, self.policy.averaged_actor)
         self._set_weight_decay()
@@ -219,15 +196,6 @@ class DPVP(GuidedOffPolicyAlgorithm, DSAC):
         super().set_parameters(load_path_or_dict, exact_match, device)
         self._set_weight_decay()  # an argument: the optimizers' state holds the one that they were saved with
 
-    def _fill_in_preset(self) -> None:
-        if self.preset not in self.presets:
-            raise ValueError(f"preset must be one of {', '.join(map(repr, self.presets))}, got {self.preset!r}.")
-        for name, value in self.presets[self.preset].items():
-            if getattr(self, name) is None:
-                setattr(self, name, value)
-        if self.preset == "paper" and self.target_entropy == "auto":
-            self.target_entropy = -8.0 * float(np.prod(self.action_space.shape))  # type: ignore[arg-type]
-
     def _check_arguments(self) -> None:
         super()._check_arguments()
         check_range("proxy_value", self.proxy_value, low=0.0, exclusive_low=True)
@@ -239,7 +207,7 @@ class DPVP(GuidedOffPolicyAlgorithm, DSAC):
         check_range("average_tau", self.average_tau, low=0.0, high=1.0)
         if self.eta_pv is not None:
             check_range("eta_pv", self.eta_pv, low=0.0, exclusive_low=True)
-        if self.preset != "paper" and initial_ent_coef(self.ent_coef) > 0.1 * self.proxy_value:
+        if self.bounded_targets and initial_ent_coef(self.ent_coef) > 0.1 * self.proxy_value:
             warnings.warn(
                 f"ent_coef={self.ent_coef!r}: the entropy bonus will swamp the takeovers' labels of +-{self.proxy_value:g}. "
                 "Use a fixed coefficient of about 0.01 times proxy_value."

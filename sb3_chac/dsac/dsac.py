@@ -2,7 +2,6 @@ from collections import defaultdict
 from collections.abc import Callable
 from typing import Any, ClassVar, TypeVar
 
-import numpy as np
 import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
@@ -16,7 +15,14 @@ from sb3_chac.common.checks import check_integer, check_learning_rate, check_ran
 from sb3_chac.common.critics import DistributionalCritic
 from sb3_chac.common.distributional import gaussian_nll, gaussian_surrogate_loss, return_targets
 from sb3_chac.common.off_policy_algorithm import CheckedOffPolicyAlgorithm
-from sb3_chac.common.utils import TargetUpdate, detach_distributions, frozen, initial_ent_coef, minimize
+from sb3_chac.common.utils import (
+    TargetUpdate,
+    detach_distributions,
+    frozen,
+    initial_ent_coef,
+    minimize,
+    target_entropy,
+)
 from sb3_chac.dsac.policies import CnnPolicy, DSACPolicy, MlpPolicy, MultiInputPolicy
 
 SelfDSAC = TypeVar("SelfDSAC", bound="DSAC")
@@ -69,7 +75,7 @@ class DSAC(CheckedOffPolicyAlgorithm):
     :param ent_coef: Entropy regularization coefficient alpha. Set it to 'auto' to learn it
         (and 'auto_0.1' for using 0.1 as initial value)
     :param target_update_interval: update the target networks every ``target_update_interval`` actor updates
-    :param target_entropy: target entropy when learning ``ent_coef``, 'auto' is minus the number of actions
+    :param target_entropy: target entropy when learning ``ent_coef``: "auto" is -1 per action, "auto_8" -8 per action
     :param ent_coef_lr: learning rate of the entropy coefficient, can be a schedule too
     :param policy_delay: gradient steps of the critics per update of the actor, the entropy coefficient and all targets
     :param eta: weight of sigma^2 in the critic's loss; sigma^2 shrinks as 1 / eta, 1 keeps it calibrated
@@ -192,8 +198,7 @@ class DSAC(CheckedOffPolicyAlgorithm):
         ]
         self.ent_coef_lr_schedule = FloatSchedule(self.ent_coef_lr)
 
-        if self.target_entropy == "auto":
-            self.target_entropy = -float(np.prod(self.action_space.shape))  # type: ignore[arg-type]
+        self.target_entropy = target_entropy(self.target_entropy, self.action_space)  # type: ignore[arg-type]
 
         learn_ent_coef = isinstance(self.ent_coef, str)
         with th.no_grad():
@@ -221,8 +226,7 @@ class DSAC(CheckedOffPolicyAlgorithm):
         check_range("eta", self.eta, low=0.0, exclusive_low=True)
         if self.tau_b is not None:
             check_range("tau_b", self.tau_b, low=0.0, high=1.0)
-        if self.target_entropy != "auto":
-            check_range("target_entropy", self.target_entropy)
+        target_entropy(self.target_entropy, self.action_space)  # type: ignore[arg-type]
         initial_ent_coef(self.ent_coef)
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
