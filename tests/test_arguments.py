@@ -40,6 +40,7 @@ GOOD = {
             "delta",
             "switch_after",
             "prefit_steps",
+            "relapse_window",
             "stage2_human_share",
             "anchor_coef",
             "cost_coef",
