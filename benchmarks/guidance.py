@@ -14,6 +14,7 @@ stage 2 that was cut off goes on from its last evaluation; others (half an hour 
 
 import argparse
 import csv
+import functools
 import importlib.metadata
 import io
 import json
@@ -109,12 +110,25 @@ def make_model(algo: str, seed: int, env_id: str, budget: int | None = None, **o
 class Record(BaseCallback):
     """Sums up the safety cost of the training, and appends a row to the CSV at each evaluation."""
 
-    def __init__(self, path: Path, labels: dict[str, Any], env_id: str, every: int, maps: range, training_cost: float):
+    def __init__(
+        self,
+        path: Path,
+        labels: dict[str, Any],
+        env_id: str,
+        every: int,
+        maps: range,
+        training_cost: float = 0.0,
+        save_to: Path | None = None,
+    ):
+        """
+        :param training_cost: so far
+        :param save_to: model and transitions at each evaluation, nothing if None
+        """
         super().__init__()
         self.env_id, self.versions = env_id, versions(env_id)
         self.path, self.labels, self.every, self.maps = path, labels, every, maps
         self.training_cost = training_cost
-        self.save_to: Path | None = None  # the model, with its transitions, at each evaluation
+        self.save_to = save_to
 
     def _on_step(self) -> bool:
         self.training_cost += sum(info["cost"] for info in self.locals["infos"])
@@ -146,9 +160,11 @@ def run(
     for folder in (results, models):
         folder.mkdir(parents=True, exist_ok=True)
     model = make_model(method.algo, seed, env_id, method.budget)
-    training_cost = 0.0
+    maps = TUNING_MAPS if seed >= FIRST_TUNING_SEED else TEST_MAPS
+    record = functools.partial(Record, path, {"method": name, "seed": seed}, env_id, every, maps)
     if method.goes_on_from is None:
         path.unlink(missing_ok=True)
+        callback = record()
     else:
         if not (path.exists() and end.exists()):
             path.unlink(missing_ok=True)
@@ -156,19 +172,26 @@ def run(
                 shutil.copy((models / f"{method.goes_on_from}-{seed}").with_suffix(suffix), end.with_suffix(suffix))
         model = type(model).load(end, env=model.get_env(), device="cpu", **method.overrides)
         model.load_replay_buffer(end.with_suffix(".pkl"))
-        training_cost = model.counts["safety_cost"]
-    maps = TUNING_MAPS if seed >= FIRST_TUNING_SEED else TEST_MAPS
-    record = Record(path, {"method": name, "seed": seed}, env_id, every, maps, training_cost)
-    if method.goes_on_from is not None:
-        record.save_to = end
-    model.learn(
-        min(method.steps, most_steps) - model.num_timesteps, callback=record, reset_num_timesteps=method.goes_on_from is None
-    )
+        forget_rows_after(path, model.num_timesteps)
+        callback = record(training_cost=model.counts["safety_cost"], save_to=end)
+    steps = min(method.steps, most_steps) - model.num_timesteps
+    model.learn(steps, callback=callback, reset_num_timesteps=method.goes_on_from is None)
     model.save(end)
     if any(other.goes_on_from == name for other in METHODS.values()):
         model.save_replay_buffer(end.with_suffix(".pkl"))
     model.get_env().close()
     return f"{name} seed {seed}: {time.process_time():.0f} CPU seconds"
+
+
+def forget_rows_after(path: Path, step: int) -> None:
+    """Drop evaluations of a state that was not saved: they will be made again."""
+    rows = read(path) if path.exists() else []
+    kept = [row for row in rows if int(row["step"]) <= step]
+    if len(kept) < len(rows):
+        with path.open("w", newline="") as file:
+            writer = csv.DictWriter(file, list(rows[0]))
+            writer.writeheader()
+            writer.writerows(kept)
 
 
 def read(path: Path) -> list[dict[str, str]]:

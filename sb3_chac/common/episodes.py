@@ -154,12 +154,14 @@ class ModelDriver:
 
     @property
     def hud(self) -> dict[str, Any]:
-        """Who acted in the last step and why, for a ``TakeoverDisplay``: nothing for models that have no stages."""
-        if not hasattr(self.model, "stage"):
+        """Stage, source of the last action and confidence, for a ``TakeoverDisplay``; empty without shared control."""
+        policy: Any = self.model.policy
+        control = getattr(policy, "control", None)
+        if control is None:
             return {}
-        control: Any = "guided" if self.model.stage == 1 else self.model.policy.control
-        choice: Any = self.model.policy.last_choice
-        shown = {"stage": self.model.stage}
+        choice, shown = policy.last_choice, dict[str, Any](stage=int(policy.stage))
+        if policy.stage == 1:
+            control = "guided"
         if control == "shared":
             if choice is None:  # before the first step
                 return shown

@@ -6,7 +6,6 @@ from contextlib import contextmanager
 
 import numpy as np
 import torch as th
-from gymnasium import spaces
 from stable_baselines3.common.distributions import Distribution
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.utils import get_parameters_by_name
@@ -113,10 +112,11 @@ def detach_distributions(policy: nn.Module) -> None:
                         setattr(holder, name, value.detach())
 
 
-def target_entropy(argument: str | float, action_space: spaces.Box) -> float:
+def target_entropy(argument: str | float, n_actions: int) -> float:
     """
     Return the entropy that a learned coefficient holds: a number is one, "auto" is -1 per action, "auto_8" -8 per action.
 
+    :param n_actions: dimension of the action space
     :raises ValueError: for another text, or a number that is not finite
     """
     if not isinstance(argument, str):
@@ -125,7 +125,7 @@ def target_entropy(argument: str | float, action_space: spaces.Box) -> float:
     matched = re.fullmatch(r"auto(?:_(\d+(?:\.\d+)?))?", argument)
     if matched is None:
         raise ValueError(f"target_entropy must be a number, 'auto' or such as 'auto_8' (-8 per action), got {argument!r}.")
-    return -float(matched[1] or 1) * float(np.prod(action_space.shape))
+    return -float(matched[1] or 1) * n_actions
 
 
 def initial_ent_coef(ent_coef: str | float) -> float:

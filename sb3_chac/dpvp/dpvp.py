@@ -207,7 +207,7 @@ class DPVP(GuidedOffPolicyAlgorithm, DSAC):
         check_range("average_tau", self.average_tau, low=0.0, high=1.0)
         if self.eta_pv is not None:
             check_range("eta_pv", self.eta_pv, low=0.0, exclusive_low=True)
-        if self.bounded_targets and initial_ent_coef(self.ent_coef) > 0.1 * self.proxy_value:
+        if initial_ent_coef(self.ent_coef) > 0.1 * self.proxy_value:
             warnings.warn(
                 f"ent_coef={self.ent_coef!r}: the entropy bonus will swamp the takeovers' labels of +-{self.proxy_value:g}. "
                 "Use a fixed coefficient of about 0.01 times proxy_value."

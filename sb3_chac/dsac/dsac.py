@@ -6,6 +6,7 @@ import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, PyTorchObs, Schedule
 from stable_baselines3.common.utils import FloatSchedule, update_learning_rate
 from stable_baselines3.sac.policies import Actor
@@ -198,7 +199,7 @@ class DSAC(CheckedOffPolicyAlgorithm):
         ]
         self.ent_coef_lr_schedule = FloatSchedule(self.ent_coef_lr)
 
-        self.target_entropy = target_entropy(self.target_entropy, self.action_space)  # type: ignore[arg-type]
+        self.target_entropy = target_entropy(self.target_entropy, get_action_dim(self.action_space))
 
         learn_ent_coef = isinstance(self.ent_coef, str)
         with th.no_grad():
@@ -226,7 +227,7 @@ class DSAC(CheckedOffPolicyAlgorithm):
         check_range("eta", self.eta, low=0.0, exclusive_low=True)
         if self.tau_b is not None:
             check_range("tau_b", self.tau_b, low=0.0, high=1.0)
-        target_entropy(self.target_entropy, self.action_space)  # type: ignore[arg-type]
+        target_entropy(self.target_entropy, get_action_dim(self.action_space))
         initial_ent_coef(self.ent_coef)
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
