@@ -10,7 +10,7 @@ export OMP_NUM_THREADS ?= 1
 
 # The main job: train C-HAC on SafeDrive with the scripted driver as the human, through RL-Zoo3's own command; evaluate what was
 # learned on maps that it has not seen, beside the human-guided policy alone and the human; draw the curves and film a drive.
-# About six minutes on two cores. The tables of the logger are in progress.csv (--verbose 0), the progress bar tells the rest.
+# Seven and a half minutes on two cores of an AMD EPYC. The tables of the logger are in progress.csv (--verbose 0), the progress bar tells the rest.
 demo: $(INSTALLED)
 	rm -rf $(DEMO)
 	$(BIN)/rl_zoo3 train --algo chac --env SafeDrive-v0 -n 15000 -params switch_after:8000 prefit_steps:2000 \

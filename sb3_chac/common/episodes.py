@@ -162,12 +162,14 @@ class ModelDriver:
         choice, shown = policy.last_choice, dict[str, Any](stage=int(policy.stage))
         if policy.stage == 1:
             control = "guided"
-        if control == "shared":
-            if choice is None:  # before the first step
-                return shown
+        is_shared = control == "shared"
+        if is_shared and choice is None:  # before the first step
+            return shown
+        self_drives = choice.self_drives.item() if is_shared else control == "self"
+        shown["drives"] = "self-learning policy" if self_drives else "guided policy"
+        if is_shared:
             shown["confidence"] = f"{choice.confidence.item():.2f}"
-            control = "self" if choice.self_drives.item() else "guided"
-        return shown | {"drives": "guided policy" if control == "guided" else "self-learning policy"}
+        return shown
 
 
 class Task(NamedTuple):
