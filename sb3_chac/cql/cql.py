@@ -11,6 +11,7 @@ from stable_baselines3.sac.policies import Actor
 
 from sb3_chac.common.arguments import checked
 from sb3_chac.common.checks import check_action_space, check_integer, check_learning_rate, check_range
+from sb3_chac.common.demonstrations import Dataset
 from sb3_chac.common.offline import Batch, OfflineAlgorithm
 from sb3_chac.common.utils import (
     TargetUpdate,
@@ -22,7 +23,6 @@ from sb3_chac.common.utils import (
     target_entropy,
 )
 from sb3_chac.cql.policies import CnnPolicy, CQLPolicy, MlpPolicy
-from sb3_chac.human.demonstrations import Dataset
 
 SelfCQL = TypeVar("SelfCQL", bound="CQL")
 
