@@ -9,7 +9,7 @@ from importlib import import_module
 # Name -> module
 OWN_COMMANDS = {
     **{name: f"sb3_chac.{name}" for name in ("drive", "evaluate", "resume", "plot", "demos")},
-    **{name: f"sb3_chac.deploy.{name}" for name in ("export",)},
+    **{name: f"sb3_chac.deploy.{name}" for name in ("export", "run")},
 }
 COMMANDS = ("train", "enjoy", "plot_train", "plot_from_file", "all_plots", *OWN_COMMANDS)
 
@@ -21,7 +21,8 @@ RL-Zoo3's commands with the algorithms of sb3_chac, and
   resume RUN_FOLDER     go on with a training that was interrupted or killed, from its newest checkpoint
   plot RUN_FOLDER       its curves: return, success rate, safety cost, what the human drove
   demos COMMAND         demonstrations: record them, look at them, drive them again
-  export MODEL.zip FILE.onnx  a model as one ONNX file, for a vehicle
+  export MODEL.zip POLICY.onnx  a model as one ONNX file, for a vehicle
+  run POLICY.onnx       that file at the end of a network link: observations in, checked actions out; without torch
 'sb3-chac train --help' lists the arguments, so does --help of the others.
 Models, replay buffers, run folders and hyperparameters files are code (docs/loading.md): open those that you trust only."""
 

@@ -25,7 +25,7 @@ LAYERS = (
     {"__main__", "_startup"},
 )
 PARENTS = {"dpvp": {"dsac"}, "chac": {"dpvp"}, "hg_dagger": {"bc"}, "iwr": {"hg_dagger", "bc"}}  # an algorithm derives from it
-HELPERS = {("drive", "evaluate"), ("demos", "evaluate"), ("plot", "evaluate")}
+HELPERS = {("drive", "evaluate"), ("demos", "evaluate"), ("plot", "evaluate"), ("deploy", "evaluate")}
 
 
 class Import(NamedTuple):
