@@ -18,7 +18,6 @@ import platform
 import resource
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -324,20 +323,21 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("command", choices=("export", "latency", "link", "cuts", "report"))
     parser.add_argument("--out", type=Path, default=HERE / "results" / "deploy")
+    parser.add_argument("--policies", type=Path, default=Path("logs/deploy"), help="folder of the exported agents")
     parser.add_argument("-n", type=int, help="observations, decisions, maps or cuts")
     args = parser.parse_args()
     if args.command == "report":
         report(args.out)
         return
-    with tempfile.TemporaryDirectory() as folder:
-        jobs = {
-            "export": (compare_exports, 10_000),
-            "latency": (measure_latency, 10_000),
-            "link": (drive_maps, 200),
-            "cuts": (cut_links, 200),
-        }
-        function, n = jobs[args.command]
-        function(args.out, Path(folder), args.n or n)
+    jobs = {
+        "export": (compare_exports, 10_000),
+        "latency": (measure_latency, 10_000),
+        "link": (drive_maps, 200),
+        "cuts": (cut_links, 200),
+    }
+    function, n = jobs[args.command]
+    args.policies.mkdir(parents=True, exist_ok=True)
+    function(args.out, args.policies, args.n or n)
     print(f"{resource.getrusage(resource.RUSAGE_SELF).ru_utime:.0f} s of CPU time")
 
 
