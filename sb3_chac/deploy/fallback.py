@@ -15,7 +15,7 @@ HALF_WIDTH, TOP_SPEED = 4.0, 15.0  # [m], [m/s] in the units of the observation
 
 class RouteFallback:
     """
-    Pure pursuit of the route in SafeDrive-v0's or RoadTest-v0's observations, at the lateral offset that the vehicle has.
+    Pure pursuit of the route in SafeDrive-v0's observations, at the lateral offset that the vehicle has.
 
     Between observations the pose is integrated with a kinematic bicycle model and the actions that were executed.
 

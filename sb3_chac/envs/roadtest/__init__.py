@@ -1,0 +1,3 @@
+from sb3_chac.envs.roadtest.env import RoadTestEnv
+
+__all__ = ["RoadTestEnv"]
