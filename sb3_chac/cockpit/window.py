@@ -10,7 +10,7 @@ import pygame
 
 from sb3_chac.cockpit.devices import Command, Keyboard
 from sb3_chac.cockpit.session import Display, Drive, indicators
-from sb3_chac.envs.display import BLACK, EGO, HUMAN, ORANGE, PANEL, RED, TEXT
+from sb3_chac.envs.driving.display import BLACK, EGO, HUMAN, ORANGE, PANEL, RED, TEXT
 
 PICTURE = pygame.Rect(0, 0, 800, 600)
 SIDE = pygame.Rect(800, 0, 320, 600)

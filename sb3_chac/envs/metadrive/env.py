@@ -10,8 +10,8 @@ from gymnasium import spaces
 from sb3_chac.common.arguments import checked
 from sb3_chac.common.checks import check_driving_action, check_integer, check_range
 from sb3_chac.common.contract import TakeoverDisplay
-from sb3_chac.envs.display import STEPS_PER_SECOND
 from sb3_chac.envs.driving.corridors import FAR, LATERALS, N_CORRIDORS, N_VIEW, ROUTE_SPACING, CorridorView, route_along
+from sb3_chac.envs.driving.display import STEPS_PER_SECOND
 from sb3_chac.envs.metadrive.drivers import DRIVERS
 from sb3_chac.envs.metadrive.simulator import check_installed, is_headless, make_simulator, prepare, release
 
@@ -361,7 +361,7 @@ class MetaDriveSafetyEnv(gym.Env, TakeoverDisplay):
         """
         :param axes: of matplotlib, where the map of the current scenario is drawn, in metres
         """
-        from sb3_chac.envs.metadrive.map import plot_map
+        from sb3_chac.envs.metadrive.roads import plot_map
 
         plot_map(self, axes)
 

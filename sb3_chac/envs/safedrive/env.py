@@ -12,11 +12,12 @@ from highway_env.road.road import Road
 from sb3_chac.common.arguments import checked
 from sb3_chac.common.checks import check_driving_action, check_integer, check_range
 from sb3_chac.common.contract import TakeoverDisplay
-from sb3_chac.envs.display import STEPS_PER_SECOND
 from sb3_chac.envs.driving.compiled import compiled
 from sb3_chac.envs.driving.corridors import N_VIEW, CorridorView
+from sb3_chac.envs.driving.display import STEPS_PER_SECOND
+from sb3_chac.envs.driving.geometry import boxes_overlap
 from sb3_chac.envs.safedrive.driver import IMPERFECTIONS, ScriptedDriver
-from sb3_chac.envs.safedrive.geometry import Pose, boxes_overlap
+from sb3_chac.envs.safedrive.geometry import Pose
 from sb3_chac.envs.safedrive.lidar import Lidar
 from sb3_chac.envs.safedrive.map import BLOCKS, HALF_WIDTH, LANES, OBSTACLE_SIZES, Map
 from sb3_chac.envs.safedrive.navigation import N_EGO, N_STATE, locate, navigation, route_ahead

@@ -6,7 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_chac.envs.safedrive.geometry import Pose, Segment, chain, sample, turn, wrap_angle
+from sb3_chac.envs.driving.geometry import wrap_angle
+from sb3_chac.envs.safedrive.geometry import Pose, Segment, chain, sample, turn
 
 LANE_WIDTH = 4.0  # [m]
 LANES = (-LANE_WIDTH / 2, LANE_WIDTH / 2)  # [m] offsets of the left and the right lane from the middle of a carriageway

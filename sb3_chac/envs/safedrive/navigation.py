@@ -4,7 +4,7 @@ import numpy as np
 
 from sb3_chac.envs.driving.compiled import compiled
 from sb3_chac.envs.driving.corridors import ROUTE_SPACING, route_along
-from sb3_chac.envs.safedrive.geometry import SPACING
+from sb3_chac.envs.driving.geometry import SPACING
 from sb3_chac.envs.safedrive.map import HALF_WIDTH
 
 CHECKPOINTS = np.array([8.0, 16.0, 26.0, 38.0, 50.0])  # [m] ahead on the route

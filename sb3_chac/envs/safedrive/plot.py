@@ -2,8 +2,9 @@
 
 from typing import TYPE_CHECKING
 
+from sb3_chac.envs.driving.geometry import SPACING
 from sb3_chac.envs.safedrive.env import ARRIVES_BEFORE_END
-from sb3_chac.envs.safedrive.geometry import SPACING, Pose
+from sb3_chac.envs.safedrive.geometry import Pose
 from sb3_chac.envs.safedrive.map import Map
 from sb3_chac.envs.safedrive.roads import areas
 

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sb3_chac.envs.display import (
+from sb3_chac.envs.driving.display import (
     ASPHALT,
     BLACK,
     FINE,
@@ -19,8 +19,8 @@ from sb3_chac.envs.display import (
     Display,
     turned,
 )  # fmt: skip
+from sb3_chac.envs.driving.geometry import SPACING
 from sb3_chac.envs.safedrive.env import ARRIVES_BEFORE_END
-from sb3_chac.envs.safedrive.geometry import SPACING
 from sb3_chac.envs.safedrive.roads import areas
 from sb3_chac.envs.safedrive.traffic import CRASHED
 

@@ -6,7 +6,8 @@ import numpy as np
 from highway_env.road.lane import AbstractLane, CircularLane, LineType, StraightLane
 from highway_env.road.road import RoadNetwork
 
-from sb3_chac.envs.safedrive.geometry import SPACING, Pose, Segment, sample, turn, wrap_angle
+from sb3_chac.envs.driving.geometry import SPACING, wrap_angle
+from sb3_chac.envs.safedrive.geometry import Pose, Segment, sample, turn
 from sb3_chac.envs.safedrive.map import (
     ARM,
     AXIS,

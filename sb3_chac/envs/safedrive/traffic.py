@@ -8,7 +8,8 @@ cross or merge, and pull over to the other lane before an obstacle. The loops ov
 import numpy as np
 
 from sb3_chac.envs.driving.compiled import compiled
-from sb3_chac.envs.safedrive.geometry import SPACING, boxes_overlap, sample
+from sb3_chac.envs.driving.geometry import SPACING, boxes_overlap
+from sb3_chac.envs.safedrive.geometry import sample
 from sb3_chac.envs.safedrive.map import LANES, OBSTACLE_SIZES, Map
 
 CAR_LENGTH, CAR_WIDTH = 5.0, 2.0  # [m]
