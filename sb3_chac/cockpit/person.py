@@ -9,9 +9,6 @@ from gymnasium import spaces
 
 from sb3_chac.cockpit.devices import Command, Device, DriverInput
 
-# Environments whose first action is positive to the left; elsewhere it is to the right
-STEERS_LEFT = ("MetaDriveSafety-v0",)
-
 
 class NotDrivable(ValueError):
     """Raised for an environment that nobody can drive in the cockpit; says why."""

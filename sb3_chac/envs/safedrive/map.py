@@ -18,6 +18,7 @@ BLOCKS = "SCROTX"  # straight, curve, ramp, roundabout, T-intersection, intersec
 START_STRAIGHT = 25.0  # [m] before the first block
 CONNECTION = 28.0  # [m] of straight road between two blocks
 RUN_OUT = 30.0  # [m] of road beyond the destination
+ARRIVES_BEFORE_END = 5.0  # [m]
 ARM = 60.0  # [m] length of the side roads
 CLEARANCE = 28.0  # [m] between the axes of roads that do not belong together
 
@@ -178,6 +179,7 @@ class Map:
         self.start = self.blocks[0].start
         segments = [segment for block in self.blocks for segment in block.route]
         self.length = length(segments) - RUN_OUT
+        self.finish = self.length - ARRIVES_BEFORE_END  # [m] along the route
         self.route = sample(self.start, segments)
         self.paths = [Path("route", self.start, segments, shared=(0.0, np.inf)), *self._other_paths()]
         self.obstacles = self._place_obstacles(rng, obstacle_density)
