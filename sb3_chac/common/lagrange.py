@@ -9,31 +9,10 @@ import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import MaybeCallback
-from stable_baselines3.common.utils import safe_mean
 from torch import nn
 
-from sb3_chac.common.checks import check_integer, check_range, is_finite
-
-
-def step_costs(infos: list[dict[str, Any]]) -> np.ndarray:
-    """
-    :param infos: of one step, one per environment
-    :return: their ``info["cost"]``, shape (n_envs,)
-    :raises ValueError: if one has none, or none that is a finite number
-    """
-    costs = np.zeros(len(infos))
-    for idx, info in enumerate(infos):
-        try:
-            costs[idx] = float(info["cost"])
-        except (KeyError, TypeError, ValueError):
-            costs[idx] = math.nan
-        if not is_finite(costs[idx]):
-            raise ValueError(
-                f"info['cost'] of environment {idx} must be a finite number at every step, got {info.get('cost', 'none')!r}: "
-                "take an environment that reports its safety cost (SafeDrive-v0 does), or wrap this one to put it there. "
-                "Nothing of this step was stored; the model can still be saved."
-            )
-    return costs
+from sb3_chac.common.checks import check_integer, check_range
+from sb3_chac.common.costs import EpisodeCosts, record_costs, step_costs
 
 
 class PIDLagrangian(nn.Module):
@@ -216,7 +195,7 @@ class CostConstrainedAlgorithm(BaseAlgorithm):
         if not hasattr(self, "ep_cost_buffer"):  # else it was loaded
             self.ep_cost_buffer: deque[float] = deque(maxlen=self._stats_window_size)
             self.safety_cost = 0.0
-        self.episode_costs = np.zeros(self.n_envs)
+        self.episode_costs = EpisodeCosts(self.n_envs)
 
     @property
     def cost_discount(self) -> float:
@@ -234,11 +213,13 @@ class CostConstrainedAlgorithm(BaseAlgorithm):
         if reset_num_timesteps:
             self.ep_cost_buffer.clear()
         if reset_num_timesteps or self._last_obs is None:  # the environments are about to be reset
-            self.episode_costs = np.zeros(self.n_envs)
+            self.episode_costs = EpisodeCosts(self.n_envs)
         return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
 
     def _count_costs(self, infos: list[dict[str, Any]], dones: np.ndarray) -> tuple[np.ndarray, list[float]]:
         """
+        Count the costs of one step.
+
         :param infos: of one step
         :param dones: shape (n_envs,)
         :return: costs of this step, shape (n_envs,), and those of the episodes that end with it
@@ -246,17 +227,12 @@ class CostConstrainedAlgorithm(BaseAlgorithm):
         """
         costs = step_costs(infos)
         self.safety_cost += float(costs.sum())
-        self.episode_costs += costs
-        is_over = dones.astype(bool)
-        finished = self.episode_costs[is_over].tolist()
-        self.episode_costs[is_over] = 0.0
+        finished = self.episode_costs.add(costs, dones)
         self.ep_cost_buffer.extend(finished)
         return costs, finished
 
     def _record_costs(self) -> None:
-        self.logger.record("safety/safety_cost", self.safety_cost)
-        if self.ep_cost_buffer:
-            self.logger.record("rollout/ep_cost_mean", safe_mean(self.ep_cost_buffer))
+        record_costs(self.logger, self.safety_cost, self.ep_cost_buffer)
 
     def _record_multiplier(self) -> None:
         self.logger.record("train/lagrange_multiplier", self.multiplier.value)

@@ -10,7 +10,7 @@ from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer
 from stable_baselines3.common.type_aliases import TensorDict
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_chac.common.lagrange import step_costs
+from sb3_chac.common.costs import step_costs
 
 
 class CostReplayBufferSamples(NamedTuple):
