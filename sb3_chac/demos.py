@@ -19,8 +19,8 @@ from sb3_chac.common.demonstrations import DatasetError, load_demonstrations, op
 from sb3_chac.datasets.recording import WatchedEnv, record
 from sb3_chac.datasets.replay import Replay
 from sb3_chac.datasets.writer import SETTINGS
-from sb3_chac.evaluate import check_output, parse_env_kwargs
 from sb3_chac.evaluation import pictures
+from sb3_chac.evaluation.arguments import check_output, parse_env_kwargs
 from sb3_chac.evaluation.episodes import NotEvaluable, make_env
 from sb3_chac.evaluation.evaluation import saved_model
 from sb3_chac.evaluation.models import DEFAULT_ENV, find_algorithm, find_normalization, load_model

@@ -26,7 +26,7 @@ from sb3_chac.cockpit.devices import (
 )
 from sb3_chac.cockpit.person import NotDrivable
 from sb3_chac.common.demonstrations import DatasetError
-from sb3_chac.evaluate import parse_env_kwargs
+from sb3_chac.evaluation.arguments import parse_env_kwargs
 from sb3_chac.evaluation.episodes import NotEvaluable
 from sb3_chac.evaluation.models import DEFAULT_ENV
 

@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from sb3_chac.common.callbacks import PROGRESS_FILE
-from sb3_chac.evaluate import check_output
+from sb3_chac.evaluation.arguments import check_output
 from sb3_chac.evaluation.episodes import NotEvaluable
 from sb3_chac.evaluation.pictures import PLOT_SUFFIXES
 

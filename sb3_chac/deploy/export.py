@@ -22,7 +22,7 @@ from sb3_chac.chac.policies import CONTROLS, CHACPolicy
 from sb3_chac.common.checks import check_action_space
 from sb3_chac.deploy.metadata import KEY, Input, Metadata, NotDeployable
 from sb3_chac.deploy.policy import OnnxPolicy
-from sb3_chac.evaluate import check_output, parse_env_kwargs
+from sb3_chac.evaluation.arguments import check_output, parse_env_kwargs
 from sb3_chac.evaluation.episodes import ModelDriver, NotEvaluable, make_env
 from sb3_chac.evaluation.evaluation import scenario_list
 from sb3_chac.evaluation.models import env_of, find_algorithm, find_normalization, load_model
