@@ -84,6 +84,8 @@ def make_parser() -> argparse.ArgumentParser:
 
 def main(arguments: list[str]) -> None:
     """
+    Run the command.
+
     :param arguments: of the command line, after ``demos``
     """
     parser = make_parser()
@@ -106,6 +108,8 @@ def _stop(signal_number: int, frame: FrameType | None) -> None:
 
 def run_record(args: argparse.Namespace) -> None:
     """
+    Record a dataset.
+
     :param args: see ``make_parser``
     :raises DatasetError: for a name that is taken, or spaces that a dataset cannot hold
     :raises FileNotFoundError: if a model does not exist
@@ -146,6 +150,8 @@ def run_record(args: argparse.Namespace) -> None:
 
 def find_model(path: Path, env_id: str, env_kwargs: dict[str, Any]) -> tuple[BaseAlgorithm, VecNormalize | None]:
     """
+    Load a model with the statistics of its observations.
+
     :return: the model, and the statistics that its observations are normalized with, if any
     """
     path, algo, algorithm = find_algorithm(path, None)
@@ -158,6 +164,8 @@ def find_model(path: Path, env_id: str, env_kwargs: dict[str, Any]) -> tuple[Bas
 
 def run_info(args: argparse.Namespace) -> None:
     """
+    Print what is in a dataset.
+
     :raises DatasetError: for a dataset that is missing, damaged or empty
     """
     print(describe(args.dataset))
@@ -165,6 +173,8 @@ def run_info(args: argparse.Namespace) -> None:
 
 def describe(dataset: str | os.PathLike[str]) -> str:
     """
+    Describe a dataset.
+
     :return: what there is to know about a dataset, to read
     :raises DatasetError: for one that is missing, damaged or empty
     """
@@ -202,6 +212,8 @@ def describe(dataset: str | os.PathLike[str]) -> str:
 
 def as_range(scenarios: list[int] | None) -> str:
     """
+    Word a list of scenarios.
+
     :return: "100:120" for 100 to 119 in their order, else the numbers themselves
     """
     if scenarios is None:
@@ -212,6 +224,8 @@ def as_range(scenarios: list[int] | None) -> str:
 
 def shortened(space: spaces.Space) -> str:
     """
+    Word a space in a few characters.
+
     :return: what to call it, without a number for each of its bounds
     """
     if not isinstance(space, spaces.Box):
@@ -221,6 +235,8 @@ def shortened(space: spaces.Space) -> str:
 
 def run_replay(args: argparse.Namespace) -> None:
     """
+    Drive an episode again.
+
     :raises DatasetError: for a dataset, or an episode of it, that is missing or cannot be driven again
     :raises NotEvaluable: if its environment cannot be made, or cannot render
     """

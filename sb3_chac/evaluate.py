@@ -77,6 +77,8 @@ def make_parser() -> argparse.ArgumentParser:
 
 def main(arguments: list[str]) -> None:
     """
+    Run the command.
+
     :param arguments: of the command line, after ``evaluate``
     """
     parser = make_parser()
@@ -95,6 +97,8 @@ def main(arguments: list[str]) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """
+    Evaluate as the command line says.
+
     :param args: see ``make_parser``
     :raises FileNotFoundError: if the model, or the folder of an output file, does not exist
     :raises NotEvaluable: for whatever else does not fit, found before the episodes run
@@ -163,6 +167,8 @@ def run(args: argparse.Namespace) -> None:
 
 def write_files(args: argparse.Namespace, evaluation: Evaluation, task: Task, filmed: int) -> None:
     """
+    Write the files of an evaluation.
+
     :param args: which files
     :param evaluation: what goes into them
     :param task: what was evaluated
@@ -184,6 +190,8 @@ def write_files(args: argparse.Namespace, evaluation: Evaluation, task: Task, fi
 
 def write_steps(file: Path, evaluation: Evaluation) -> None:
     """
+    Write the steps of all episodes.
+
     :param file: CSV, gets a row for each step: scenario (or episode), step, x and y [m] before it, the action, and cost: 1 if
         any arose in it
     :param evaluation: made with ``record_paths=True``

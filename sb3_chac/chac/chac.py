@@ -355,6 +355,8 @@ class CHAC(DPVP):
 
     def _reward_scale(self) -> float:
         """
+        Return the scale of the rewards.
+
         :return: the unit of the rewards that Z_c learns
         """
         return max(self.reward_square**0.5, 1e-8) if self.normalize_rewards else 1.0
@@ -364,6 +366,8 @@ class CHAC(DPVP):
         self, batch: DualReplayBufferSamples, rewards: th.Tensor, ent_coef: th.Tensor
     ) -> tuple[th.Tensor, th.Tensor]:
         """
+        Compute the return targets under shared control.
+
         :return: y_q and y_z with a' from shared control, both of shape (batch_size,)
         """
         self_actions, log_prob = self.self_actor_target.action_log_prob(batch.next_observations)
@@ -412,6 +416,8 @@ class CHAC(DPVP):
 
     def _mean_log_prob(self) -> float:
         """
+        Estimate the log-likelihood of the guided policy's own actions.
+
         :return: mean of log pi_g over a batch
         """
         with th.no_grad():

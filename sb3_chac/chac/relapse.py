@@ -40,6 +40,8 @@ class RelapseWatch:
 
     def add(self, score: float) -> None:
         """
+        Note the score of an episode.
+
         :param score: of an episode that is over
         """
         self.scores.append(score)

@@ -75,6 +75,8 @@ class Window:
 
     def run(self, drive: Drive, is_over: Callable[[], bool]) -> None:
         """
+        Show a drive until it is over.
+
         :param drive: is shown
         :param is_over: asked after each frame
         """
@@ -95,6 +97,8 @@ class Window:
 
     def handle(self, event: Any) -> None:
         """
+        Take in an event of pygame.
+
         :param event: of pygame
         """
         command = self.drive.person.handle(event)

@@ -49,6 +49,8 @@ class GuidedProgressBar(ProgressBarCallback):
 
     def text(self) -> str:
         """
+        Word the progress.
+
         :return: e.g. "stage 2, self 31 %, human 12 % (1850 steps), cost 9"
         """
         counts = self.model.counts

@@ -224,6 +224,8 @@ class GuidedOffPolicyAlgorithm(CheckedOffPolicyAlgorithm):
 
     def _announce_step(self) -> list[tuple[int, int]]:
         """
+        Announce the next step to the wrappers.
+
         :return: numbers of steps and resets by others since the last one, of each wrapped environment
         """
         may_drive = self._may_drive()
@@ -233,6 +235,8 @@ class GuidedOffPolicyAlgorithm(CheckedOffPolicyAlgorithm):
 
     def _may_drive(self) -> list[int]:
         """
+        Share the rest of the budget.
+
         :return: indices of the environments whose human may drive the next step without exceeding the budget
         """
         if self._budget is None:
@@ -305,6 +309,8 @@ class GuidedOffPolicyAlgorithm(CheckedOffPolicyAlgorithm):
 
     def _check_received(self, idx: int, info: dict[str, Any], sent: np.ndarray) -> None:
         """
+        Check that an action arrived as it was sent.
+
         :param sent: scaled to [-1, 1]
         :raises ValueError: if another action arrived where the human takes over than the one that was sent
         """
@@ -342,6 +348,8 @@ class GuidedOffPolicyAlgorithm(CheckedOffPolicyAlgorithm):
 
     def _happens(self, idx: int, key: str, value: bool, done: bool) -> bool:
         """
+        Tell whether an event begins.
+
         :return: whether an event begins that ``info[key]`` tells of
         """
         if key not in LASTING:

@@ -82,6 +82,8 @@ class PIDLagrangian(nn.Module):
 
     def update(self, episode_cost: float) -> float:
         """
+        Update the multiplier.
+
         :param episode_cost: J
         :return: the new multiplier, also ``value``
         """

@@ -31,6 +31,8 @@ class CostActorCriticPolicy(ActorCriticPolicy):
 
     def predict_cost_values(self, obs: PyTorchObs) -> th.Tensor:
         """
+        Predict the costs to come.
+
         :param obs: batch of observations
         :return: discounted costs to come, shape (batch_size, 1)
         """

@@ -57,6 +57,8 @@ class CostReplayBuffer(ReplayBuffer):
 
     def _of_costs(self) -> Any:
         """
+        View the buffer as one of costs.
+
         :return: a copy that shares all arrays, with costs in place of rewards
         """
         of_costs = copy.copy(self)
@@ -94,6 +96,8 @@ class CostNStepReplayBuffer(CostReplayBuffer, NStepReplayBuffer):
 
 def default_buffer_class(observation_space: spaces.Space, n_steps: int) -> type[CostReplayBuffer]:
     """
+    Choose the replay buffer.
+
     :param n_steps: number of rewards in a return
     :return: the buffer for these observations
     :raises ValueError: for Dict observations and ``n_steps`` above 1

@@ -188,6 +188,8 @@ class MetaDriveSafetyEnv(DrivingEnv):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
         """
+        Begin an episode.
+
         :param options: {"scenario": k} to drive map k
         :raises ValueError: if k is not an integer from 0 to 999,999
         """
@@ -239,6 +241,8 @@ class MetaDriveSafetyEnv(DrivingEnv):
 
     def _touching(self, vehicles: bool, objects: bool) -> set[str]:
         """
+        Name the objects that touch the ego.
+
         :param vehicles: whether a vehicle touched the ego in this step
         :param objects: whether an object did
         :return: names of what did: what still does, or else the nearest of its kind within 15 m, or else its kind (MetaDrive
@@ -270,6 +274,8 @@ class MetaDriveSafetyEnv(DrivingEnv):
 
     def _info(self, info: dict[str, Any]) -> dict[str, Any]:
         """
+        Build the info.
+
         :param info: MetaDrive's
         """
         self.last_info = self._driving_info(
@@ -309,6 +315,8 @@ class MetaDriveSafetyEnv(DrivingEnv):
 
     def scripted_driver(self, name: str = "scripted") -> Any:
         """
+        Make a driver by its name.
+
         :param name: "scripted" (with a human's imperfections), "scripted-ideal" (without), "idm" or "ppo" (MetaDrive's own)
         :return: a driver for this environment
         :raises ValueError: for another name
@@ -326,6 +334,8 @@ class MetaDriveSafetyEnv(DrivingEnv):
 
     def plot_map(self, axes: Any) -> None:
         """
+        Draw the map of the current scenario.
+
         :param axes: of matplotlib, where the map of the current scenario is drawn, in metres
         """
         from sb3_chac.envs.metadrive.roads import plot_map
@@ -379,6 +389,8 @@ def route_ahead(observation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _road(values: list[float], width: float) -> tuple[tuple[float, float], float, float]:
     """
+    Rebuild a road from the observation of its end.
+
     :param values: of a checkpoint, as MetaDrive gives them, each in [0, 1]
     :param width: [m] of the road
     :return: position [m] of the checkpoint, curvature [1/m] of the middle of the road that ends there, positive to the left,

@@ -31,6 +31,8 @@ DOWNWARDS = np.array([1.0, -1.0])  # MetaDrive's y axis points upwards
 
 class Viewer(Display):
     """
+    View of MetaDrive from above.
+
     :param env: the environment to show
     """
 

@@ -187,6 +187,8 @@ class SafeDriveEnv(DrivingEnv):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
         """
+        Begin an episode.
+
         :param options: {"scenario": k} to drive map k
         :raises ValueError: if k is not an integer
         """
@@ -316,6 +318,8 @@ class SafeDriveEnv(DrivingEnv):
 
     def scan(self) -> tuple[np.ndarray, np.ndarray]:
         """
+        Cast the lidar's rays.
+
         :return: [m] distances along the lidar's rays, shape (240,), and indices of the boxes that can be seen
         """
         return self.lidar.scan(
@@ -333,6 +337,8 @@ class SafeDriveEnv(DrivingEnv):
 
     def scripted_driver(self, name: str = "scripted") -> ScriptedDriver:
         """
+        Make a driver by its name.
+
         :param name: "scripted" (with a human's imperfections) or "scripted-ideal" (without)
         :return: a driver for this environment
         :raises ValueError: for another name
@@ -355,6 +361,8 @@ class SafeDriveEnv(DrivingEnv):
 
     def plot_map(self, axes: Any) -> None:
         """
+        Draw the map of the current scenario.
+
         :param axes: of matplotlib, where the map of the current scenario is drawn, in metres, y downwards
         """
         from sb3_chac.envs.safedrive.plot import plot_map
@@ -375,6 +383,8 @@ class SafeDriveEnv(DrivingEnv):
 
 def layout(rays: int, corridors: bool) -> list[dict[str, Any]]:
     """
+    Describe the numbers of an observation.
+
     :param rays: of the lidar
     :param corridors: whether they follow
     :return: of an observation, see ``SafeDriveEnv.observation_layout``; t is tanh
@@ -406,6 +416,8 @@ def layout(rays: int, corridors: bool) -> list[dict[str, Any]]:
 @compiled
 def _boxes(car_positions, car_headings, positions, headings, sizes, there):
     """
+    Collect everything that can be hit or seen.
+
     :param positions: of the obstacles, shape (n, 2), with their headings, sizes (length, width) and whether they are there
     :return: positions, headings, lengths and widths of the cars, then of the obstacles that are there
     """

@@ -14,6 +14,8 @@ class Pose(NamedTuple):
 
     def shifted(self, ahead: float, right: float = 0.0, turn: float = 0.0) -> "Pose":
         """
+        Move and turn the pose.
+
         :param ahead: [m] along the heading
         :param right: [m] to the right of it
         :param turn: [rad] added to the heading
@@ -36,6 +38,8 @@ class Segment(NamedTuple):
 
     def offset(self, right: float) -> "Segment":
         """
+        Return the parallel segment.
+
         :param right: [m]
         :return: the parallel segment at that distance to the right
         """
@@ -48,6 +52,8 @@ class Segment(NamedTuple):
 
 def turn(radius: float, angle: float) -> Segment:
     """
+    Make the segment of a turn.
+
     :param radius: [m]
     :param angle: [rad], positive to the right
     """
@@ -56,6 +62,8 @@ def turn(radius: float, angle: float) -> Segment:
 
 def chain(start: Pose, segments: list[Segment]) -> list[Pose]:
     """
+    Compute the poses between segments.
+
     :return: the pose at the start of every segment, and at the end of the last
     """
     poses = [start]
@@ -66,6 +74,8 @@ def chain(start: Pose, segments: list[Segment]) -> list[Pose]:
 
 def sample(start: Pose, segments: list[Segment]) -> np.ndarray:
     """
+    Sample points along segments.
+
     :return: points every ``SPACING`` along the segments, shape (n, 4): x, y, heading, curvature
     """
     starts = np.cumsum([0.0, *(segment.length for segment in segments)])

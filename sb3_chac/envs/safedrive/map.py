@@ -100,6 +100,8 @@ def length(segments: list[Segment]) -> float:
 
 def way(kind: str, arm: float, to: float) -> list[Segment]:
     """
+    Find the way through a junction.
+
     :param kind: "O", "T" or "X"
     :param arm: [rad] direction of the arm that one comes from, seen from the middle of the junction
     :param to: [rad] direction of the arm that one leaves by
@@ -205,6 +207,8 @@ class Map:
 
     def _is_clear(self, points: np.ndarray, joint: np.ndarray) -> bool:
         """
+        Tell whether new roads keep clear of those that are there.
+
         :param points: along the axes of new roads
         :param joint: where they join the last block; close to it they may be close to each other
         """

@@ -38,6 +38,8 @@ def locate(route: np.ndarray, s: float, position: np.ndarray, heading: float) ->
 @compiled
 def navigation(route: np.ndarray, s: float, position: np.ndarray, heading: float) -> np.ndarray:
     """
+    Observe the checkpoints ahead.
+
     :param s: [m] along the route
     :param heading: [rad] of the ego
     :return: for each checkpoint its bearing and the heading of the route there, as they are observed, shape (N_NAVIGATION,)

@@ -44,6 +44,8 @@ def plot_map(road_map: Map, axes: "Axes") -> None:
 
 def _on_route(road_map: Map, s: float, lateral: float) -> tuple[float, float]:
     """
+    Convert coordinates of the route.
+
     :param s: [m] along the route
     :param lateral: [m] to the right of it
     """

@@ -39,6 +39,8 @@ ARROW, RAY, ECHO = (140, 176, 158), (190, 225, 140), (250, 255, 80)
 
 class Viewer(Display):
     """
+    View of SafeDrive from above.
+
     :param env: the environment to show
     """
 
@@ -72,6 +74,8 @@ class Viewer(Display):
 
     def _on_route(self, s: float) -> np.ndarray:
         """
+        Find a point of the route.
+
         :param s: [m] along the route; beyond its end it goes on straight
         :return: [m], shape (2,)
         """

@@ -142,6 +142,8 @@ def _entry(block: Block, arm: float) -> Pose:
 
 def areas(road_map: Map, finish: float) -> list[Area]:
     """
+    Collect the areas of a map.
+
     :param finish: [m] along the route, where the destination is
     :return: what to paint, in this order
     """
@@ -191,6 +193,8 @@ def areas(road_map: Map, finish: float) -> list[Area]:
 
 def along(start: Pose, segments: list[Segment]) -> np.ndarray:
     """
+    Sample poses along a line.
+
     :return: poses every ``SPACING`` and at the end, shape (n, 3)
     """
     end = start
@@ -201,6 +205,8 @@ def along(start: Pose, segments: list[Segment]) -> np.ndarray:
 
 def strip(poses: np.ndarray, left: float, right: float) -> np.ndarray:
     """
+    Make the area between two parallels.
+
     :param poses: shape (n, 3)
     :param left: [m] to the right of the poses, likewise ``right``
     :return: corners of the area between the two, shape (2 n, 2)
@@ -211,6 +217,8 @@ def strip(poses: np.ndarray, left: float, right: float) -> np.ndarray:
 
 def strips(start: Pose, segments: list[Segment], left: float, right: float) -> list[np.ndarray]:
     """
+    Make the area between two parallels in pieces.
+
     :return: pieces, each with its shape (n, 2), of the area between two parallels of a line
     """
     poses = along(start, segments)
@@ -220,6 +228,8 @@ def strips(start: Pose, segments: list[Segment], left: float, right: float) -> l
 
 def dashes(start: Pose, segments: list[Segment], right: float) -> list[np.ndarray]:
     """
+    Make the dashes of a broken line.
+
     :param right: [m] where the broken line is
     """
     poses = along(start, segments)
@@ -293,6 +303,8 @@ def _islands(block: Block) -> list[Area]:
 
 def outline(block: Block, margin: float = 0.0) -> np.ndarray:
     """
+    Make the outline of a junction.
+
     :param margin: [m] that is added around it
     :return: the rim of a junction from arm to arm, shape (n, 2)
     """

@@ -29,6 +29,8 @@ class Ego(Vehicle):
 
     def control(self, steering: float, acceleration: float) -> None:
         """
+        Set the controls.
+
         :param steering: in [-1, 1], positive to the right
         :param acceleration: in [-1, 1]
         """
@@ -36,6 +38,8 @@ class Ego(Vehicle):
 
     def slip_at(self, steering: float, speed: float) -> float:
         """
+        Compute the slip angle.
+
         :param steering: [rad]
         :param speed: [m/s]
         :return: [rad] between heading and velocity; it understeers where v^2 sin(slip) / (length / 2) would be above the limit
