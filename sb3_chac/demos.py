@@ -42,6 +42,7 @@ tells how far that led elsewhere than when it was recorded. The environment must
 
 
 def make_parser() -> argparse.ArgumentParser:
+    """Make the parser of the command line."""
     parser = argparse.ArgumentParser(
         "sb3-chac demos", description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
     )

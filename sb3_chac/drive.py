@@ -46,6 +46,7 @@ SAVE_FREQ = 600  # steps: a minute
 
 
 def make_parser() -> argparse.ArgumentParser:
+    """Make the parser of the command line."""
     parser = argparse.ArgumentParser(
         "sb3-chac drive", description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -31,6 +31,7 @@ A model and its vecnormalize.pkl are code (docs/loading.md): load those that you
 
 
 def make_parser() -> argparse.ArgumentParser:
+    """Make the parser of the command line."""
     parser = argparse.ArgumentParser(
         "sb3-chac evaluate", description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
     )

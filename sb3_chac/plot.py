@@ -34,6 +34,8 @@ class NotPlottable(NotEvaluable):
 
 
 class Panel(NamedTuple):
+    """How a curve is drawn."""
+
     title: str
     subtitle: str
     colour: str

@@ -1,3 +1,5 @@
+"""Behaviour cloning (BC)."""
+
 from collections import defaultdict
 from typing import Any, ClassVar, TypeVar
 

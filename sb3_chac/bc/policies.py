@@ -1,3 +1,5 @@
+"""Policies that are fitted to demonstrations, of BC, HG-DAgger and IWR."""
+
 import math
 from typing import Any, ClassVar
 

@@ -1,3 +1,5 @@
+"""Confidence-guided human-AI collaboration (C-HAC)."""
+
 import warnings
 from collections import deque
 from typing import Any, ClassVar, TypeVar
@@ -463,7 +465,7 @@ class CHAC(DPVP):
         policy: str | None = None,
     ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
         """
-        As in SB3, and:
+        Predict actions, as in SB3, under shared control.
 
         :param policy: who acts in stage 2: "guided" (pi_g), "self" (pi_r) or "shared"; by default as in training
         :raises ValueError: for another ``policy``

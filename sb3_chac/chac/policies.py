@@ -1,3 +1,5 @@
+"""Policies of C-HAC, with shared control."""
+
 from typing import Any, ClassVar, NamedTuple
 
 import torch as th

@@ -1,3 +1,5 @@
+"""Relapses of C-HAC's stage 2, and the best policy."""
+
 import math
 from collections import deque
 from typing import Any, NamedTuple

@@ -1,4 +1,5 @@
-"""The cockpit for a browser: the page, the pictures and what the driver does, over one WebSocket per viewer.
+"""
+The cockpit for a browser: the page, the pictures and what the driver does, over one WebSocket per viewer.
 
 Who may connect: only who has the access token of this drive, from a page that this server has sent. See ``Server``.
 """

@@ -299,6 +299,7 @@ def fits(value: Any, hint: Any) -> bool:
 
 
 def is_finite_number(value: Any) -> bool:
+    """Tell whether a value is a finite number."""
     try:
         return math.isfinite(value)
     except (OverflowError, TypeError):  # an int of hundreds of digits, a complex number

@@ -257,6 +257,7 @@ def checkpoints(folder: Path) -> list[Path]:
 
 
 def is_number(name: str) -> bool:
+    """Tell whether the name of a folder is a number."""
     return name.isascii() and name.isdecimal()
 
 

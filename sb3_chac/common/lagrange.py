@@ -18,6 +18,7 @@ from sb3_chac.common.costs import EpisodeCosts, record_costs, step_costs
 class PIDLagrangian(nn.Module):
     """
     Lagrange multiplier of the constraint "the mean cost of an episode is at most ``cost_limit``", moved by a PID controller.
+
     Paper: "Responsive Safety in Reinforcement Learning by PID Lagrangian Methods" (Stooke et al. 2020),
     https://arxiv.org/abs/2007.03964
 
@@ -108,7 +109,7 @@ def constrained_actor_loss(
     log_prob: th.Tensor, q_values: th.Tensor, cost_q_values: th.Tensor, ent_coef: th.Tensor | float, multiplier: float
 ) -> th.Tensor:
     """
-    ``mean[ (alpha log pi - min Q + lambda max Q_c) / (1 + lambda) ]``
+    Compute the actor's loss ``mean[ (alpha log pi - min Q + lambda max Q_c) / (1 + lambda) ]``.
 
     :param log_prob: log pi of the actor's actions, shape (batch_size,)
     :param q_values: of the reward's critics for these actions, shape (batch_size, n_critics)
@@ -123,7 +124,7 @@ def constrained_actor_loss(
 
 def constrained_advantages(advantages: th.Tensor, cost_advantages: th.Tensor, multiplier: float, normalize: bool) -> th.Tensor:
     """
-    ``(A_r - lambda A_c) / (1 + lambda)``
+    Combine the advantages of reward and cost, ``(A_r - lambda A_c) / (1 + lambda)``.
 
     :param advantages: A_r, of the reward, shape (batch_size,)
     :param cost_advantages: A_c, of the cost, shape (batch_size,)
@@ -161,7 +162,7 @@ class CostConstrainedAlgorithm(BaseAlgorithm):
         pid_delay: int,
     ) -> None:
         """
-        The arguments of the constructor that are about costs: those of ``PIDLagrangian``, and
+        Store the arguments of the constructor that are about costs: those of ``PIDLagrangian`` and ``cost_gamma``.
 
         :param cost_gamma: discount factor of costs; ``gamma`` if None
         """

@@ -1,3 +1,5 @@
+"""Conservative Q-learning (CQL)."""
+
 import math
 from typing import Any, ClassVar, TypeVar
 

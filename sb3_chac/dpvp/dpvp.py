@@ -1,3 +1,5 @@
+"""Distributional proxy value propagation (D-PVP)."""
+
 import io
 import pathlib
 import warnings

@@ -1,3 +1,5 @@
+"""Distributional soft actor-critic (DSAC)."""
+
 from collections import defaultdict
 from collections.abc import Callable
 from typing import Any, ClassVar, TypeVar

@@ -1,3 +1,5 @@
+"""The discriminator of GAIL."""
+
 from typing import Any
 
 import numpy as np

@@ -1,3 +1,5 @@
+"""Generative adversarial imitation learning (GAIL)."""
+
 from collections import defaultdict
 from typing import Any, ClassVar, TypeVar
 

@@ -1,3 +1,5 @@
+"""Human-gated DAgger (HG-DAgger)."""
+
 import math
 import warnings
 from typing import Any, ClassVar, TypeVar

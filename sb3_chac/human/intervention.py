@@ -1,3 +1,5 @@
+"""The wrapper in which an expert takes over from the novice."""
+
 import copy
 from enum import StrEnum
 from typing import Any

@@ -1,3 +1,5 @@
+"""Intervention weighted regression (IWR)."""
+
 from typing import TypeVar
 
 import numpy as np

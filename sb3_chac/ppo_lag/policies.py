@@ -1,3 +1,5 @@
+"""Policies of PPO-Lag, with a value function of the cost."""
+
 from functools import partial
 
 import numpy as np

@@ -1,3 +1,5 @@
+"""PPO with a Lagrange multiplier on the safety cost (PPO-Lag)."""
+
 from collections import defaultdict
 from typing import Any, ClassVar, TypeVar
 

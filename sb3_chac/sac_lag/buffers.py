@@ -79,7 +79,9 @@ class CostDictReplayBuffer(CostReplayBuffer, DictReplayBuffer):
 
 class CostNStepReplayBuffer(CostReplayBuffer, NStepReplayBuffer):
     """
-    ``CostReplayBuffer`` of n-step returns. The parameters are those of SB3's ``NStepReplayBuffer``, and:
+    ``CostReplayBuffer`` of n-step returns.
+
+    The parameters are those of SB3's ``NStepReplayBuffer``, and ``cost_gamma``.
 
     :param cost_gamma: discount factor of costs
     """

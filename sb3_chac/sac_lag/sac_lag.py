@@ -1,3 +1,5 @@
+"""SAC with a Lagrange multiplier on the safety cost (SAC-Lag)."""
+
 import io
 import pathlib
 import warnings

@@ -139,6 +139,7 @@ def evaluating(hyperparams: dict[str, Any]) -> Iterator[None]:
 
 
 def is_a_number(text: str) -> bool:
+    """Tell whether a text is a finite number."""
     try:
         return math.isfinite(float(text))
     except ValueError:
@@ -146,6 +147,7 @@ def is_a_number(text: str) -> bool:
 
 
 def is_whole(value: Any) -> bool:
+    """Tell whether a value is a finite whole number, of any type."""
     return isinstance(value, int | float) and math.isfinite(value) and value == int(value)
 
 

@@ -240,7 +240,7 @@ class PlanningDriver(ABC):
     # The plan
 
     def _speed_cap(self) -> float:
-        """[m/s] with which the ego can take the curves ahead after comfortable braking, and less if it heads off the road"""
+        """Limit the speed [m/s] to what the curves ahead allow after comfortable braking, and more if heading off the road."""
         ahead = np.arange(0.0, self.PREVIEW, 2 * SPACING)
         curvature = np.abs(self._curvature(self.s + ahead))
         squares = LATERAL_ACCELERATION / np.maximum(curvature, 1e-3) + 2 * 1.5 * np.maximum(ahead - 2.0, 0.0)

@@ -8,6 +8,8 @@ from sb3_chac.envs.driving.geometry import SPACING
 
 
 class Pose(NamedTuple):
+    """Position [m] and heading [rad] in the plane."""
+
     x: float
     y: float
     heading: float

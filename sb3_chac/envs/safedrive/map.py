@@ -51,6 +51,8 @@ class Path(NamedTuple):
 
 
 class Obstacle(NamedTuple):
+    """Obstacle on the carriageway of the route."""
+
     kind: str  # of OBSTACLE_SIZES
     s: float  # [m] along the route
     lateral: float  # [m] to the right of the middle of the carriageway
@@ -58,6 +60,8 @@ class Obstacle(NamedTuple):
 
 @dataclass
 class Block:
+    """Block of a map: a piece of the route with its side roads."""
+
     kind: str  # of BLOCKS, or "-" for the straight road between them
     start: Pose  # where the middle of the ego's carriageway enters
     route: list[Segment]  # the ego's carriageway
@@ -94,7 +98,7 @@ class Block:
 
 
 def length(segments: list[Segment]) -> float:
-    """[m]"""
+    """Add up the lengths [m] of segments."""
     return sum(segment.length for segment in segments)
 
 

@@ -36,6 +36,8 @@ RIM = AXIS + HALF_WIDTH  # [m] from the axis of a road to its edge
 
 
 class Area(NamedTuple):
+    """Area of a map, to be painted."""
+
     kind: str  # "kerb", "asphalt", "route" (asphalt that the ego may drive on), "grass", "trees", "line" or "black"
     points: np.ndarray  # [m] corners, shape (n, 2)
 

@@ -53,7 +53,7 @@ class Ego(Vehicle):
 
     @property
     def yaw_rate(self) -> float:
-        """[rad/s]"""
+        """Yaw rate [rad/s], positive to the right."""
         return self.speed * math.sin(self.slip) / (self.LENGTH / 2)
 
     def step(self, dt: float) -> None:
