@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from shell import clean_environment, run, wait_until
+from shell import clean_environment, run, wait_until, zoo_train
 from stable_baselines3.common.callbacks import ConvertCallback
 from stable_baselines3.common.save_util import load_from_pkl
 
@@ -210,14 +210,6 @@ def test_a_damaged_checkpoint_costs_what_is_said(killed, tmp_path, monkeypatch, 
     assert command == TRAIN and model == RUNS / "SafeDrive-v0_3" / "checkpoints" / older.name / "SafeDrive-v0.zip"
     (line,) = capsys.readouterr().err.splitlines()
     assert f"which costs {int(newest.name) - int(older.name)} steps" in line and "is damaged" in line
-
-
-def zoo_train(monkeypatch, *arguments: str) -> None:
-    """RL-Zoo3's command, in this process."""
-    from rl_zoo3.train import train
-
-    monkeypatch.setattr(sys, "argv", ["rl_zoo3", *arguments])
-    train()
 
 
 def test_more_steps_with_other_environments_and_normalization(tmp_path, monkeypatch, capsys):

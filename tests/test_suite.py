@@ -117,7 +117,8 @@ def test_a_full_disk_leaves_the_job_unfinished(tmp_path, monkeypatch):
     assert results.state(job) == ""
 
 
-def test_the_report_has_all_methods_and_names_what_contradicts_the_paper(tmp_path):
+def test_the_report_has_all_methods_and_names_what_contradicts_the_paper(tmp_path, monkeypatch):
+    monkeypatch.setattr(suite_report, "RESAMPLES", 50)
     results = suite.Results(tmp_path)
     jobs = [a_job(name, seed) for name in ("pvp", "dpvp", "chac", "chac-no-share") for seed in (0, 1)]
     for job in jobs:
@@ -170,7 +171,7 @@ def test_a_killed_suite_goes_on_from_checkpoints_and_takes_its_processes_along(t
     assert subprocess.run(arguments, capture_output=True, text=True).stdout.startswith("1 jobs: 1 done, 0 to do")
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize("number", [pytest.param(signal.SIGTERM, marks=pytest.mark.slow), signal.SIGINT])
 def test_a_signal_ends_the_suite_and_its_jobs_in_good_order(tmp_path, number):
     arguments = command(tmp_path, "run", "--rows", "pvp", "dpvp", "--seeds", "1", "--scale", "0.02", "--jobs", "1")
     process = subprocess.Popen(arguments, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
@@ -199,6 +200,7 @@ def test_a_failed_job_does_not_stop_the_others(tmp_path):
     assert (tmp_path / "results" / "human-0" / "episodes.csv").is_file()
 
 
+@pytest.mark.slow
 def test_a_ray_cluster_of_two_nodes_survives_the_loss_of_a_worker(tmp_path):
     pytest.importorskip("ray", reason='needs Ray: pip install "sb3-chac[ray]"')
     from ray.cluster_utils import Cluster
