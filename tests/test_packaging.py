@@ -69,7 +69,7 @@ def test_stock_rl_zoo3_in_a_fresh_environment(dist, source, tmp_path, dependenci
     else:
         # Packages in there are found, but no .pth file in there is read: an editable installation of ours is not seen
         (site_packages / "dependencies.pth").write_text(sysconfig.get_path("purelib"))
-        install += ["--no-deps", "--no-build-isolation", "--ignore-installed"]
+        install += ["--no-deps", "--ignore-installed"]
         rl_zoo3.write_text(f"#!{python}\nfrom rl_zoo3.cli import main\nmain()\n")
         rl_zoo3.chmod(0o755)
 
