@@ -26,14 +26,14 @@ from sb3_chac.common.checkpoints import (
 )
 from sb3_chac.envs.safedrive import SafeDriveEnv
 from sb3_chac.plot import read_progress
-from sb3_chac.resume import find_training, steps
 from sb3_chac.resume import main as resume
+from sb3_chac.zoo.runs import find_training, steps
 
 SCRIPTS = Path(sysconfig.get_path("scripts"))
 RUNS = Path("logs") / "chac"
-SWITCH_AFTER, TOTAL = 150, 330
+SWITCH_AFTER, TOTAL = 150, 300
 TRAIN = [
-    *("--algo", "chac", "--env", "SafeDrive-v0", "-n", str(TOTAL), "--save-freq", "60", "--eval-freq", "165"),
+    *("--algo", "chac", "--env", "SafeDrive-v0", "-n", str(TOTAL), "--save-freq", "60", "--eval-freq", "150"),
     *("--eval-episodes", "1", "-f", "logs", "--seed", "1", "--env-kwargs", "horizon:60", "blocks:2"),
     *(
         "-params",
