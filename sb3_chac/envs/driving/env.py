@@ -122,7 +122,7 @@ class DrivingEnv(gym.Env, TakeoverDisplay):
     def _make_viewer(self) -> Display:
         """Return what draws this environment."""
 
-    def render(self) -> np.ndarray | None:  # type: ignore[override]
+    def render(self) -> np.ndarray | None:
         """
         Draw the current state.
 
