@@ -6,7 +6,7 @@ RL-Zoo3's are for places where the stock ``rl_zoo3`` command does not find them 
 import sys
 from importlib import import_module
 
-OWN_COMMANDS = ("drive", "evaluate", "resume", "plot", "demos")  # a module each
+OWN_COMMANDS = ("drive", "evaluate", "resume", "plot", "compare", "demos")  # a module each
 COMMANDS = ("train", "enjoy", "plot_train", "plot_from_file", "all_plots", *OWN_COMMANDS)
 
 USAGE = f"""usage: sb3-chac {{{",".join(COMMANDS)}}} ...
@@ -16,6 +16,7 @@ RL-Zoo3's commands with the algorithms of sb3_chac, and
   evaluate MODEL.zip    a model or an expert on held-out scenarios
   resume RUN_FOLDER     go on with a training that was interrupted or killed, from its newest checkpoint
   plot RUN_FOLDER       its curves: return, success rate, safety cost, what the human drove
+  compare RUN RUN ...   several runs in one figure and table, with intervals over seeds
   demos COMMAND         demonstrations: record them, look at them, drive them again
 'sb3-chac train --help' lists the arguments, so does --help of the others.
 Models, replay buffers, run folders and hyperparameters files are code (docs/loading.md): open those that you trust only."""
