@@ -1,4 +1,4 @@
-"""The moving picture of the README: a novice drives, the human takes over and hands back, then the self-learning policy drives.
+"""The moving picture of the README: novice, takeover, hand back, and the self-learning policy of stage 2.
 
     python benchmarks/film.py      # writes docs/_static/takeover.gif, a minute of CPU time
 
@@ -16,13 +16,13 @@ from PIL import Image, ImageDraw, ImageFont
 from stable_baselines3 import SAC
 
 from sb3_chac import CHAC, InterventionWrapper
-from sb3_chac.common.episodes import ModelDriver
+from sb3_chac.evaluation.episodes import ModelDriver
 
 HERE = Path(__file__).parent
 OUT = HERE.parent / "docs" / "_static" / "takeover.gif"
 FPS, SIZE, COLOURS, CAPTION = 10, (480, 360), 64, 34
 MAPS = range(1000, 1050)
-BEFORE, LONGEST, AFTER, STAGE_2 = 25, 60, 20, 70  # steps that are shown
+BEFORE, LONGEST, AFTER, STAGE_2 = 20, 60, 15, 60  # steps that are shown
 
 NOVICE, HUMAN, HANDED_BACK = "A novice drives", "The human takes over: this teaches the novice", "The human hands back"
 
@@ -51,6 +51,7 @@ def takeover() -> list[Image.Image]:
     model = SAC.load(HERE / "agents" / "sac-SafeDrive-v0.zip", device="cpu")
     for number in MAPS:
         drives = run(env, model, number)
+        print(f"map {number}: the human drove {sum(drives)} of {len(drives)} steps", flush=True)
         starts = [k for k in range(BEFORE, len(drives)) if drives[k] and not any(drives[k - BEFORE : k])]
         for start in starts:
             end = next((k for k in range(start, len(drives)) if not drives[k]), len(drives))

@@ -36,10 +36,10 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
 from sb3_chac import DSAC, InterventionWrapper
-from sb3_chac.common.evaluation import evaluate
 from sb3_chac.common.guided import GuidedOffPolicyAlgorithm
 from sb3_chac.envs import ONE_PER_PROCESS
-from sb3_chac.zoo.registration import hyperparams_file
+from sb3_chac.evaluation.evaluation import evaluate
+from sb3_chac.zoo.algorithms import hyperparams_file
 
 HERE = Path(__file__).parent
 RESULTS = {

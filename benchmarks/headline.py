@@ -10,13 +10,14 @@ one of its method; the figures are those at the step that all others have reache
 
 import argparse
 import csv
+import re
 import sys
 from pathlib import Path
 
 import numpy as np
 
-from sb3_chac.common import curves
-from sb3_chac.common.curves import Curves, Method
+from sb3_chac.evaluation import curves
+from sb3_chac.evaluation.curves import Curves, Method
 
 HERE = Path(__file__).parent
 README, PICTURE = HERE.parent / "README.md", HERE.parent / "docs" / "headline.png"
@@ -53,7 +54,7 @@ def load(folder: Path, name: str) -> tuple[list[Curves], int]:
     :return: its runs, cut where the shortest of them ends, stage 1 before stage 2; and the number of maps of an evaluation
     """
     runs, maps = [], 0
-    for path in sorted(folder.glob(f"{name}-[0-9]*.csv")):
+    for path in sorted(path for path in folder.glob("*.csv") if re.fullmatch(rf"{name}-\d+", path.stem)):
         rows = read(path)
         run = to_curves(rows, 2 if name in STAGE_1 else 1)
         if name in STAGE_1:
@@ -141,9 +142,7 @@ if __name__ == "__main__":
     if arguments.check:
         sys.exit("README.md: the table is not that of the CSVs, run benchmarks/headline.py." if new != old else 0)
     README.write_text(new, encoding="utf-8")
-    methods = [
-        Method(method.title + ("" if has_corridors else " ¹"), method.runs) for method, _, has_corridors in collected
-    ]
+    methods = [Method(method.title + ("" if has_corridors else " ¹"), method.runs) for method, _, has_corridors in collected]
     figure = curves.draw(methods, (curves.SUCCESS, curves.COST, curves.TRAINING_COST), width=3.4)
     figure.axes[1].set_ylim(0, 4)
     figure.axes[2].set_yscale("symlog", linthresh=10)

@@ -30,9 +30,9 @@ from stable_baselines3.common.evaluation import evaluate_policy
 
 import sb3_chac
 from sb3_chac import GAIL, InterventionWrapper
-from sb3_chac.common.evaluation import evaluate
-from sb3_chac.human.demonstrations import Demonstrations
-from sb3_chac.zoo.registration import ALGORITHMS, hyperparams_file
+from sb3_chac.common.demonstrations import Demonstrations
+from sb3_chac.evaluation.evaluation import evaluate
+from sb3_chac.zoo.algorithms import ALGORITHMS, hyperparams_file
 
 HERE = Path(__file__).parent
 RESULTS = HERE / "results" / "imitation"

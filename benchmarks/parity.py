@@ -87,7 +87,7 @@ def ours(algo: str, seed: int, columns: dict[str, np.ndarray]) -> float:
     import torch as th
 
     from sb3_chac import BC, CQL
-    from sb3_chac.human.demonstrations import Demonstrations
+    from sb3_chac.common.demonstrations import Demonstrations
 
     th.set_num_threads(1)
     env = gym.make(ENV)

@@ -27,11 +27,11 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback, EveryNTimesteps
 
 import sb3_chac.envs  # noqa: F401
-from sb3_chac.common.evaluation import evaluate
 from sb3_chac.envs.safedrive.driver import ScriptedDriver
 from sb3_chac.envs.safedrive.geometry import boxes_overlap
 from sb3_chac.envs.safedrive.navigation import N_STATE, route_ahead
 from sb3_chac.envs.safedrive.traffic import CAR_LENGTH, CAR_WIDTH
+from sb3_chac.evaluation.evaluation import evaluate
 from sb3_chac.human import InterventionWrapper
 
 RESULTS = Path(__file__).parent / "results" / "safedrive"

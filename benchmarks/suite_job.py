@@ -26,10 +26,10 @@ import yaml
 
 import sb3_chac
 from sb3_chac.common.checkpoints import FOLDER, newest_checkpoint, sound_checkpoint
-from sb3_chac.human.demonstrations import load_demonstrations
+from sb3_chac.common.demonstrations import load_demonstrations
 from sb3_chac.plot import join
-from sb3_chac.resume import steps
-from sb3_chac.zoo.registration import ALGORITHMS, hyperparams_file
+from sb3_chac.zoo.algorithms import ALGORITHMS, hyperparams_file
+from sb3_chac.zoo.runs import steps
 
 DEMONSTRATION_STEPS = 50_000  # of the human, for the row of the human and the methods that learn offline
 VALIDATION_EPISODES, EVALUATIONS, CHECKPOINTS = 10, 10, 20

@@ -6,7 +6,11 @@ RL-Zoo3's are for places where the stock ``rl_zoo3`` command does not find them 
 import sys
 from importlib import import_module
 
-OWN_COMMANDS = ("drive", "evaluate", "resume", "plot", "compare", "demos")  # a module each
+# Name -> module
+OWN_COMMANDS = {
+    **{name: f"sb3_chac.{name}" for name in ("drive", "evaluate", "resume", "plot", "compare", "demos")},
+    **{name: f"sb3_chac.deploy.{name}" for name in ("export",)},
+}
 COMMANDS = ("train", "enjoy", "plot_train", "plot_from_file", "all_plots", *OWN_COMMANDS)
 
 USAGE = f"""usage: sb3-chac {{{",".join(COMMANDS)}}} ...
@@ -18,6 +22,7 @@ RL-Zoo3's commands with the algorithms of sb3_chac, and
   plot RUN_FOLDER       its curves: return, success rate, safety cost, what the human drove
   compare RUN RUN ...   several runs in one figure and table, with intervals over seeds
   demos COMMAND         demonstrations: record them, look at them, drive them again
+  export MODEL.zip FILE.onnx  a model as one ONNX file, for a vehicle
 'sb3-chac train --help' lists the arguments, so does --help of the others.
 Models, replay buffers, run folders and hyperparameters files are code (docs/loading.md): open those that you trust only."""
 
@@ -30,7 +35,7 @@ def main() -> None:
     if command not in COMMANDS:
         sys.exit(f"{USAGE}\n\nsb3-chac: {command!r} is not a command, choose from {', '.join(COMMANDS)}.")
     if command in OWN_COMMANDS:
-        import_module(f"sb3_chac.{command}").main(sys.argv[2:])
+        import_module(OWN_COMMANDS[command]).main(sys.argv[2:])
         return
 
     from sb3_chac.zoo import register

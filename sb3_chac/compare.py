@@ -4,11 +4,11 @@ import argparse
 import re
 from pathlib import Path
 
-from sb3_chac.common import curves
-from sb3_chac.common.curves import Method
-from sb3_chac.common.episodes import NotEvaluable
-from sb3_chac.common.pictures import PLOT_SUFFIXES
 from sb3_chac.evaluate import check_output
+from sb3_chac.evaluation import curves
+from sb3_chac.evaluation.curves import Method
+from sb3_chac.evaluation.episodes import NotEvaluable
+from sb3_chac.evaluation.pictures import PLOT_SUFFIXES
 from sb3_chac.plot import NotPlottable, join
 
 DESCRIPTION = """Compare runs of 'rl_zoo3 train': learning curves (mean over seeds, shaded its 95 % bootstrap interval) in one
@@ -24,7 +24,8 @@ a run and the one that resumed it. Both stages of C-HAC are one curve, a diamond
 
 NAMES = {
     "sac": "SAC", "ppo": "PPO", "td3": "TD3", "tqc": "TQC", "dsac": "DSAC", "pvp": "PVP", "dpvp": "D-PVP", "chac": "C-HAC",
-    "sac_lag": "SAC-Lag", "ppo_lag": "PPO-Lag", "bc": "BC", "cql": "CQL", "gail": "GAIL", "hg_dagger": "HG-DAgger", "iwr": "IWR",
+    "sac_lag": "SAC-Lag", "ppo_lag": "PPO-Lag", "bc": "BC", "cql": "CQL", "gail": "GAIL",
+    "hg_dagger": "HG-DAgger", "iwr": "IWR",
 }  # fmt: skip
 TABLE_SUFFIXES = (".md", ".tex")
 QUANTITIES = (curves.RETURN, curves.SUCCESS, curves.TRAINING_COST, curves.HUMAN_STEPS)
@@ -36,7 +37,10 @@ def make_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("runs", nargs="+", metavar="RUN", help="[LABEL=]FOLDER[+FOLDER ...]")
     parser.add_argument(
-        "--x", choices=("steps", "human"), default="steps", help="environment steps, or those driven by the human (%(default)s)"
+        "--x",
+        choices=("steps", "human"),
+        default="steps",
+        help="environment steps, or the human's (%(default)s)",
     )
     parser.add_argument(
         "--out", nargs="+", type=Path, default=[Path("compare.png")], metavar="FILE", help=".png, .svg or .pdf (compare.png)"

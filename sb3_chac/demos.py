@@ -1,14 +1,13 @@
 """``python -m sb3_chac demos``: record demonstrations, look at them, drive them again."""
 
 import argparse
-import math
 import os
 import signal
 import sys
 from collections.abc import Callable
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch as th
@@ -16,16 +15,15 @@ from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_chac.common import pictures
-from sb3_chac.common.episodes import NotEvaluable, Runner, Task, check_names_no_code, make_env, registered_spec
-from sb3_chac.common.evaluation import saved_model
-from sb3_chac.evaluate import DEFAULT_ENV, check_output, find_algorithm, find_normalization, load_model, parse_env_kwargs
-from sb3_chac.human.dataset_writer import SETTINGS
-from sb3_chac.human.demonstrations import DatasetError, load_demonstrations, open_dataset
-from sb3_chac.human.recording import WatchedEnv, record
-
-if TYPE_CHECKING:
-    from minari import MinariDataset
+from sb3_chac.common.demonstrations import DatasetError, load_demonstrations, open_dataset
+from sb3_chac.datasets.recording import WatchedEnv, record
+from sb3_chac.datasets.replay import Replay
+from sb3_chac.datasets.writer import SETTINGS
+from sb3_chac.evaluate import check_output, parse_env_kwargs
+from sb3_chac.evaluation import pictures
+from sb3_chac.evaluation.episodes import NotEvaluable, make_env
+from sb3_chac.evaluation.evaluation import saved_model
+from sb3_chac.evaluation.models import DEFAULT_ENV, find_algorithm, find_normalization, load_model
 
 DESCRIPTION = """Demonstrations are datasets in Minari's format, see 'minari list local', in the folder MINARI_DATASETS_PATH,
 ~/.minari/datasets if it is not set. A folder may be named in place of an id.
@@ -241,73 +239,3 @@ def run_replay(args: argparse.Namespace) -> None:
     print(replay.report())
     if args.video:
         print(f"Saved {args.video}")
-
-
-class Replay(Runner):
-    """
-    Repeats the actions of an episode. A context manager, which closes its environment.
-
-    :param dataset: holds the episode
-    :param number: of the episode
-    :param render_mode: of the environment
-    :raises DatasetError: if there is no such episode, or neither its environment nor its seed is known
-    :raises NotEvaluable: if the environment cannot be made, see ``registered_spec``
-    """
-
-    def __init__(self, dataset: "MinariDataset", number: int, render_mode: str | None = None) -> None:
-        if not 0 <= number < dataset.total_episodes:
-            raise DatasetError(f"{dataset.id}: there is no episode {number}, they are 0 to {dataset.total_episodes - 1}.")
-        spec = dataset.env_spec
-        if spec is None:
-            raise DatasetError(f"{dataset.id} does not say how its environment is made: it cannot be driven again.")
-        (self.metadata,) = dataset.storage.get_episode_metadata([number])
-        if self.metadata.get("seed") is None:
-            raise DatasetError(f"{dataset.id} does not hold the seed of episode {number}: it cannot be driven again.")
-        self.recorded = dataset[number]
-        self.observations: list[np.ndarray] = []
-        self.rewards: list[float] = []
-        spec = registered_spec(spec, f"dataset {dataset.id}")
-        check_names_no_code(self.metadata.get("options"), spec, f"dataset {dataset.id}")
-        super().__init__(Task(lambda observation: None, spec, {}), render_mode)
-
-    def __enter__(self) -> "Replay":
-        return self
-
-    def episode(self, number: int, on_step: Callable[[], None] = lambda: None) -> tuple[dict[str, Any], None]:
-        """
-        :param number: of the episode
-        :param on_step: called after the reset and after each step
-        :return: number, return and steps; see ``report`` for how they differ from those recorded
-        """
-        observation, _ = self.env.reset(seed=self.metadata["seed"], options=self.metadata.get("options"))
-        self.observations, self.rewards = [observation], []
-        on_step()
-        is_discrete = isinstance(self.env.action_space, spaces.Discrete)
-        for action in self.recorded.actions:
-            observation, reward, terminated, truncated, _ = self.env.step(int(action) if is_discrete else action)
-            self.observations.append(observation)
-            self.rewards.append(float(reward))
-            on_step()
-            if terminated or truncated:
-                break
-        return {"episode": number, "return": math.fsum(self.rewards), "steps": len(self.rewards)}, None
-
-    def report(self) -> str:
-        """
-        :return: how what happened differs from what was recorded, to read
-        """
-        steps, recorded_steps = len(self.rewards), len(self.recorded.rewards)
-        total, recorded_total = math.fsum(self.rewards), math.fsum(self.recorded.rewards)
-        gaps = [  # as far as both go
-            float(np.max(np.abs(np.asarray(now, float) - then), initial=0.0))
-            for now, then in zip(self.observations, self.recorded.observations, strict=False)
-        ]
-        differing = np.flatnonzero(gaps)
-        lines = [
-            f"episode {self.recorded.id}: recorded {recorded_steps} steps, return {recorded_total:.6g}; "
-            f"replayed {steps} steps, return {total:.6g}",
-            f"  the returns differ by {abs(total - recorded_total):.3g}, the observations by {max(gaps):.3g} at most",
-        ]
-        if len(differing):
-            lines.append(f"  the first difference is after step {differing[0]}")
-        return "\n".join(lines)

@@ -25,9 +25,10 @@ from sb3_chac.cockpit.devices import (
     save_config,
 )
 from sb3_chac.cockpit.person import NotDrivable
-from sb3_chac.common.episodes import NotEvaluable
-from sb3_chac.evaluate import DEFAULT_ENV, parse_env_kwargs
-from sb3_chac.human.demonstrations import DatasetError
+from sb3_chac.common.demonstrations import DatasetError
+from sb3_chac.evaluate import parse_env_kwargs
+from sb3_chac.evaluation.episodes import NotEvaluable
+from sb3_chac.evaluation.models import DEFAULT_ENV
 
 DESCRIPTION = """Train with yourself as the human: watch the novice drive, take over at any moment, hand back.
 
@@ -129,7 +130,7 @@ def run(args: argparse.Namespace, arguments: list[str]) -> None:
     :param arguments: that they come from
     """
     from sb3_chac.cockpit.recording import finish_recording
-    from sb3_chac.resume import NotResumable, find_training
+    from sb3_chac.zoo.runs import NotResumable, find_training
 
     if args.resume:
         try:
@@ -175,8 +176,8 @@ def check_arguments(args: argparse.Namespace) -> None:
 
     import sb3_chac.envs  # noqa: F401
     from sb3_chac.cockpit.browser import parse_address
-    from sb3_chac.cockpit.run import drivable_algorithms
-    from sb3_chac.human.dataset_writer import folder_to_make
+    from sb3_chac.datasets.writer import folder_to_make
+    from sb3_chac.zoo.algorithms import drivable_algorithms
 
     if args.algo not in drivable_algorithms():
         known = ", ".join(drivable_algorithms())

@@ -12,9 +12,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from sb3_chac.common.callbacks import PROGRESS_FILE
-from sb3_chac.common.episodes import NotEvaluable
-from sb3_chac.common.pictures import PLOT_SUFFIXES
 from sb3_chac.evaluate import check_output
+from sb3_chac.evaluation.episodes import NotEvaluable
+from sb3_chac.evaluation.pictures import PLOT_SUFFIXES
 
 DESCRIPTION = """Draw a run of 'rl_zoo3 train' with an algorithm of sb3_chac over its steps: return and success rate of the
 evaluations, and of the training itself the safety cost, what the human drove and, for C-HAC, what the self-learning policy

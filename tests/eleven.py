@@ -5,8 +5,8 @@ import numpy as np
 from gymnasium import spaces
 
 import sb3_chac
-from sb3_chac.human.demonstrations import Demonstrations
-from sb3_chac.zoo.registration import ALGORITHMS
+from sb3_chac.common.demonstrations import Demonstrations
+from sb3_chac.zoo.algorithms import ALGORITHMS
 
 GUIDED = ("PVP", "DPVP", "CHAC", "HGDagger", "IWR")
 OFFLINE = ("BC", "CQL")

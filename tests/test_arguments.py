@@ -16,7 +16,7 @@ from sb3_chac.common.arguments import RANGES, annotations, fits
 from sb3_chac.common.buffers import DualReplayBuffer
 from sb3_chac.envs.safedrive import SafeDriveEnv
 from sb3_chac.human import DisagreementRule, InterventionWrapper, RiskRule
-from sb3_chac.zoo.registration import ALGORITHMS
+from sb3_chac.zoo.algorithms import ALGORITHMS
 
 BOX = spaces.Box(-1, 1, (2,), np.float32)
 OWNERS = {

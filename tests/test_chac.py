@@ -14,7 +14,7 @@ from stable_baselines3.common.utils import set_random_seed
 
 from sb3_chac import CHAC, DPVP, DSAC
 from sb3_chac.common.distributional import probability_of_improvement
-from sb3_chac.zoo.registration import hyperparams_file
+from sb3_chac.zoo.algorithms import hyperparams_file
 
 OBS = np.random.default_rng(0).normal(size=(40, 2)).astype(np.float32)
 

@@ -34,7 +34,7 @@ from sb3_chac.common.checkpoints import (
     sound_checkpoint,
     verify,
 )
-from sb3_chac.zoo.registration import ALGORITHMS
+from sb3_chac.zoo.algorithms import ALGORITHMS
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 SMALL = {"policy_kwargs": {"net_arch": [8]}, "buffer_size": 200}

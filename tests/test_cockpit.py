@@ -37,7 +37,7 @@ from sb3_chac.cockpit.recording import FOLDER
 from sb3_chac.cockpit.session import DriveEnded
 from sb3_chac.cockpit.window import Window
 from sb3_chac.common.checkpoints import sound_checkpoint
-from sb3_chac.human.demonstrations import load_demonstrations
+from sb3_chac.common.demonstrations import load_demonstrations
 
 
 class Clock:

@@ -14,9 +14,9 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnvWrapper, VecNormalize
 
 from sb3_chac.common.checks import UnsupportedActionSpace
+from sb3_chac.common.demonstrations import load_demonstrations
+from sb3_chac.datasets.recording import record
 from sb3_chac.human import InterventionWrapper
-from sb3_chac.human.demonstrations import load_demonstrations
-from sb3_chac.human.recording import record
 
 HUMAN = np.array([0.25, -0.25])
 each_guided = pytest.mark.parametrize("name", GUIDED)

@@ -24,10 +24,10 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.vec_env import DummyVecEnv, VecTransposeImage
 from torch.utils import _pytree
 
+from sb3_chac.common.demonstrations import DatasetError, Demonstrations, load_demonstrations
+from sb3_chac.datasets.recording import WatchedEnv, record
 from sb3_chac.demos import main as command
 from sb3_chac.human import InterventionWrapper, TakeoverRule
-from sb3_chac.human.demonstrations import DatasetError, Demonstrations, load_demonstrations
-from sb3_chac.human.recording import WatchedEnv, record
 
 TOY = "toy_env:ToyDrive-v0"
 OBSERVATIONS, ACTIONS = toy_env.ToyDrive().observation_space, toy_env.ToyDrive().action_space

@@ -1,4 +1,4 @@
-"""``sb3-chac evaluate`` and ``sb3_chac.common.evaluation.evaluate``, on the environments of toy_env.py."""
+"""``sb3-chac evaluate`` and ``sb3_chac.evaluation.evaluate``, on the environments of toy_env.py."""
 
 import csv
 import json
@@ -18,11 +18,11 @@ from stable_baselines3 import A2C, DDPG, DQN, PPO, SAC, TD3
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_chac import DSAC
-from sb3_chac.common.evaluation import evaluate, scenario_list
+from sb3_chac.common.demonstrations import load_demonstrations
 from sb3_chac.demos import main as demos
-from sb3_chac.evaluate import find_algorithm
 from sb3_chac.evaluate import main as command
-from sb3_chac.human.demonstrations import load_demonstrations
+from sb3_chac.evaluation.evaluation import evaluate, scenario_list
+from sb3_chac.evaluation.models import find_algorithm
 
 TOY = "toy_env:ToyDrive-v0"
 QUICK = {"learning_starts": 10, "buffer_size": 100, "seed": 0}

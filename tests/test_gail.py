@@ -13,8 +13,8 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_chac import GAIL
+from sb3_chac.common.demonstrations import DatasetError, Demonstrations
 from sb3_chac.gail.discriminator import Discriminator, discriminator_loss, imitation_rewards
-from sb3_chac.human.demonstrations import DatasetError, Demonstrations
 
 LOW, HIGH = np.array([-1.0, 0.0], np.float32), np.array([1.0, 10.0], np.float32)
 

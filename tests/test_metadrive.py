@@ -15,9 +15,9 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
 from sb3_chac import DPVP, InterventionWrapper
-from sb3_chac.common.evaluation import evaluate
 from sb3_chac.envs.metadrive import PRESETS, MetaDriveSafetyEnv
 from sb3_chac.envs.safedrive import SafeDriveEnv
+from sb3_chac.evaluation.evaluation import evaluate
 
 needs_metadrive = pytest.mark.skipif(
     importlib.util.find_spec("metadrive") is None,

@@ -18,10 +18,10 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from sb3_chac.bc import BC
 from sb3_chac.bc.policies import gaussian_nll, squared_errors
 from sb3_chac.common.checkpoints import ResumableCheckpoint, newest_checkpoint
+from sb3_chac.common.demonstrations import DatasetError, Demonstrations
 from sb3_chac.common.offline import DatasetSampler
 from sb3_chac.cql import CQL
 from sb3_chac.cql.cql import conservative_gap
-from sb3_chac.human.demonstrations import DatasetError, Demonstrations
 
 LOW, HIGH = np.array([-1.0, 0.0], np.float32), np.array([1.0, 10.0], np.float32)
 GAIN = np.array([[0.5, -0.3], [0.2, 0.4], [0.0, 0.3]], np.float32)  # of the expert, in scaled actions

@@ -26,8 +26,8 @@ from sb3_chac.common.checkpoints import (
 )
 from sb3_chac.envs.safedrive import SafeDriveEnv
 from sb3_chac.plot import read_progress
-from sb3_chac.resume import find_training, steps
 from sb3_chac.resume import main as resume
+from sb3_chac.zoo.runs import find_training, steps
 
 SCRIPTS = Path(sysconfig.get_path("scripts"))
 RUNS = Path("logs") / "chac"

@@ -11,9 +11,9 @@ import pytest
 import yaml
 from shell import run
 
-from sb3_chac.human.demonstrations import Demonstrations
+from sb3_chac.common.demonstrations import Demonstrations
 from sb3_chac.zoo import hyperparams_file
-from sb3_chac.zoo.registration import ALGORITHMS
+from sb3_chac.zoo.algorithms import ALGORITHMS
 
 ZOO = Path(sysconfig.get_path("scripts")) / "rl_zoo3"
 QUICK = ["--env", "Pendulum-v1", "-n", "300", "--eval-freq", "150", "--eval-episodes", "1", "-f", "logs", "--seed", "1"]

@@ -9,9 +9,9 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from sb3_chac.bc.policies import LOSSES, BCPolicy, CnnPolicy, MlpPolicy
 from sb3_chac.common.arguments import checked
 from sb3_chac.common.checks import check_range
+from sb3_chac.common.demonstrations import Dataset
 from sb3_chac.common.offline import Batch, OfflineAlgorithm
 from sb3_chac.common.utils import minimize
-from sb3_chac.human.demonstrations import Dataset
 
 SelfBC = TypeVar("SelfBC", bound="BC")
 

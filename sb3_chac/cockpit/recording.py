@@ -12,9 +12,9 @@ import numpy as np
 from gymnasium.envs.registration import EnvSpec
 
 from sb3_chac.common.checkpoints import sync
-from sb3_chac.human.dataset_writer import DatasetWriter, folder_to_make, storable_spec
-from sb3_chac.human.demonstrations import DatasetError, check_spaces
-from sb3_chac.human.recording import Recorder as EpisodeRecorder
+from sb3_chac.common.demonstrations import DatasetError, check_spaces
+from sb3_chac.datasets.recording import Recorder as EpisodeRecorder
+from sb3_chac.datasets.writer import DatasetWriter, folder_to_make, storable_spec
 
 if TYPE_CHECKING:
     from minari.data_collector import EpisodeBuffer

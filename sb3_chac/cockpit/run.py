@@ -13,7 +13,6 @@ from rl_zoo3.exp_manager import ExperimentManager
 from rl_zoo3.utils import ALGOS
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-import sb3_chac
 from sb3_chac.cockpit.devices import Device
 from sb3_chac.cockpit.env import Cockpit
 from sb3_chac.cockpit.learner import DrivenTraining, driven
@@ -21,19 +20,9 @@ from sb3_chac.cockpit.person import STEERS_LEFT, NotDrivable, Person, check_driv
 from sb3_chac.cockpit.recording import Recorder, Summary
 from sb3_chac.cockpit.session import Drive
 from sb3_chac.common.checkpoints import ResumableCheckpoint
-from sb3_chac.common.guided import GuidedOffPolicyAlgorithm
 from sb3_chac.human.intervention import InterventionWrapper
 from sb3_chac.zoo import register
-from sb3_chac.zoo.registration import ALGORITHMS
-
-
-def drivable_algorithms() -> dict[str, type[GuidedOffPolicyAlgorithm]]:
-    """
-    :return: by their names on the command line, the algorithms that learn from takeovers
-    """
-    classes = {name: getattr(sb3_chac, public) for name, public in ALGORITHMS.items()}
-    return {name: found for name, found in classes.items() if issubclass(found, GuidedOffPolicyAlgorithm)}
-
+from sb3_chac.zoo.algorithms import drivable_algorithms
 
 DEFAULT_RATE = 10.0  # [1/s]
 

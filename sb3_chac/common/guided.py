@@ -18,8 +18,8 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_chac.common import contract
 from sb3_chac.common.buffers import DualReplayBuffer
 from sb3_chac.common.checks import check_action_space, check_reset, number_in
+from sb3_chac.common.demonstrations import Dataset, load_demonstrations
 from sb3_chac.common.off_policy_algorithm import CheckedOffPolicyAlgorithm
-from sb3_chac.human.demonstrations import Dataset, load_demonstrations
 
 SelfGuided = TypeVar("SelfGuided", bound="GuidedOffPolicyAlgorithm")
 

@@ -15,8 +15,8 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_chac.common.checks import check_action_space, check_integer, check_learning_rate, check_range
+from sb3_chac.common.demonstrations import Dataset, Demonstrations, check_spaces, load_demonstrations, missing_dataset
 from sb3_chac.common.utils import fix_statistics
-from sb3_chac.human.demonstrations import Dataset, Demonstrations, check_spaces, load_demonstrations, missing_dataset
 
 SelfOffline = TypeVar("SelfOffline", bound="OfflineAlgorithm")
 

@@ -11,10 +11,10 @@ from stable_baselines3.sac.policies import Actor
 
 from sb3_chac.common.arguments import checked
 from sb3_chac.common.checks import check_action_space, check_integer, check_learning_rate, check_range
+from sb3_chac.common.demonstrations import Dataset
 from sb3_chac.common.offline import Batch, OfflineAlgorithm
 from sb3_chac.common.utils import TargetUpdate, detach_distributions, frozen, initial_ent_coef, minimize
 from sb3_chac.cql.policies import CnnPolicy, CQLPolicy, MlpPolicy
-from sb3_chac.human.demonstrations import Dataset
 
 SelfCQL = TypeVar("SelfCQL", bound="CQL")
 

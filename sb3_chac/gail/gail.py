@@ -16,9 +16,9 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_chac.common.arguments import checked
 from sb3_chac.common.checked_rollouts import CheckedRollouts
 from sb3_chac.common.checks import check_action_space, check_integer, check_learning_rate, check_range
+from sb3_chac.common.demonstrations import Dataset, Demonstrations, check_spaces, load_demonstrations, missing_dataset
 from sb3_chac.common.utils import minimize
 from sb3_chac.gail.discriminator import Discriminator, discriminator_loss, imitation_rewards
-from sb3_chac.human.demonstrations import Dataset, Demonstrations, check_spaces, load_demonstrations, missing_dataset
 
 SelfGAIL = TypeVar("SelfGAIL", bound="GAIL")
 

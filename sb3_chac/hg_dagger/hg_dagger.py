@@ -15,9 +15,9 @@ from sb3_chac.bc.policies import LOSSES, BCPolicy, CnnPolicy, MlpPolicy
 from sb3_chac.common.arguments import checked
 from sb3_chac.common.buffers import DualReplayBuffer, TransitionStore
 from sb3_chac.common.checks import check_integer, check_range
+from sb3_chac.common.demonstrations import Dataset, check_spaces
 from sb3_chac.common.guided import GuidedOffPolicyAlgorithm
 from sb3_chac.common.utils import fix_statistics, minimize
-from sb3_chac.human.demonstrations import Dataset, check_spaces
 
 SelfHGDagger = TypeVar("SelfHGDagger", bound="HGDagger")
 

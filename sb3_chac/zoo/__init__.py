@@ -1,3 +1,4 @@
-from sb3_chac.zoo.registration import hyperparams_file, register
+from sb3_chac.zoo.algorithms import hyperparams_file
+from sb3_chac.zoo.registration import register
 
 __all__ = ["hyperparams_file", "register"]

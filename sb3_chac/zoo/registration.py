@@ -1,39 +1,10 @@
 """What RL-Zoo3 has to be told of our algorithms, and gymnasium of our environments."""
 
 import importlib
-from pathlib import Path
 from types import ModuleType
 
 import sb3_chac
-
-# Names on RL-Zoo3's command line -> public class
-ALGORITHMS = {
-    "dsac": "DSAC",
-    "pvp": "PVP",
-    "dpvp": "DPVP",
-    "chac": "CHAC",
-    "sac_lag": "SACLag",
-    "ppo_lag": "PPOLag",
-    "bc": "BC",
-    "cql": "CQL",
-    "gail": "GAIL",
-    "hg_dagger": "HGDagger",
-    "iwr": "IWR",
-}
-
-
-def hyperparams_file(algo: str) -> Path:
-    """
-    :param algo: name on RL-Zoo3's command line, e.g. "dsac", or "sac" for SB3's algorithms on our environments
-    :return: our default hyperparameters: inside an installed package, beside it in a checkout (editable install)
-    :raises FileNotFoundError: if there are none
-    """
-    package = Path(sb3_chac.__file__).parent
-    for folder in (package, package.parent):
-        path = folder / "hyperparams" / f"{algo}.yml"
-        if path.is_file():
-            return path
-    raise FileNotFoundError(f"sb3_chac has no hyperparameters for {algo!r}, choose from {sorted(ALGORITHMS)}.")
+from sb3_chac.zoo.algorithms import ALGORITHMS
 
 
 def register() -> None:

@@ -129,6 +129,10 @@ class MetaDriveSafetyEnv(gym.Env, TakeoverDisplay):
     """
 
     metadata = {"render_modes": ["rgb_array", "human"], "render_fps": STEPS_PER_SECOND}  # noqa: RUF012
+    # What a runtime on a vehicle has to know (sb3_chac.deploy.metadata)
+    action_names = ("steering", "throttle")
+    brake_action = (None, -1.0)  # keeps the steering
+    coast_action = (None, 0.0)
 
     @checked
     def __init__(

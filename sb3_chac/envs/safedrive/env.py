@@ -112,6 +112,10 @@ class SafeDriveEnv(gym.Env, TakeoverDisplay):
     """
 
     metadata = {"render_modes": ["rgb_array", "human"], "render_fps": STEPS_PER_SECOND}  # noqa: RUF012
+    # What a runtime on a vehicle has to know (sb3_chac.deploy.metadata)
+    action_names = ("steering", "acceleration")
+    brake_action = (None, -1.0)  # keeps the steering
+    coast_action = (None, 0.0)
 
     @checked
     def __init__(
@@ -219,6 +223,11 @@ class SafeDriveEnv(gym.Env, TakeoverDisplay):
         if self.render_mode == "human":
             self.render()
         return self._observe(), self._info()
+
+    @property
+    def observation_layout(self) -> list[dict[str, Any]]:
+        """Name, first element, element after the last, unit and meaning of each part of an observation."""
+        return layout(self.lidar.rays, corridors=self._corridors is not None)
 
     # Dynamics
 
@@ -407,6 +416,36 @@ class SafeDriveEnv(gym.Env, TakeoverDisplay):
         return self._road[1]
 
     _road: tuple[Map, Road] | None = None
+
+
+def layout(rays: int, corridors: bool) -> list[dict[str, Any]]:
+    """
+    :param rays: of the lidar
+    :param corridors: whether they follow
+    :return: of an observation, see ``SafeDriveEnv.observation_layout``; t is tanh
+    """
+    parts = [
+        ("left_edge", 1, "m", "distance d to the left edge of the carriageway, d / 4 - 1"),
+        ("right_edge", 1, "m", "distance d to the right edge of the carriageway, d / 4 - 1"),
+        ("heading_error", 1, "rad", "heading against the route, t(angle / 0.15)"),
+        ("speed", 1, "m/s", f"2 v / {MAX_SPEED:g} - 1"),
+        ("steering_angle", 1, "rad", "angle of the front wheels, positive to the right, t(angle / 0.15)"),
+        ("last_action", 2, "1", "last action"),
+        ("yaw_rate", 1, "rad/s", "positive to the right, t(rate / 0.3)"),
+        ("lane_offset", 1, "m", "offset from the middle of the nearest lane, to the right, t(d / 0.5)"),
+        ("checkpoints", N_STATE - N_EGO, "rad", "8, 16, 26, 38, 50 m ahead: bearing t(angle / 0.4), heading t(angle / 0.6)"),
+        ("lidar", rays, "m", "closeness 1 - d / 50, clockwise from straight ahead"),
+    ]
+    if corridors:
+        parts += [
+            ("corridors", N_VIEW // 2, "m", "closeness 1 - d / 40 in arcs, then in strips along the route"),
+            ("corridor_changes", N_VIEW // 2, "m", "change of each free distance since the observation before, d / 1.5"),
+        ]
+    result, start = [], 0
+    for name, size, unit, meaning in parts:
+        result.append({"name": name, "start": start, "stop": start + size, "unit": unit, "meaning": meaning})
+        start += size
+    return result
 
 
 @compiled

@@ -18,9 +18,8 @@ from stable_baselines3.common.vec_env.base_vec_env import CloudpickleWrapper
 from tqdm import tqdm
 
 import sb3_chac
-from sb3_chac.chac import CHAC
 from sb3_chac.common.checks import check_integer
-from sb3_chac.common.episodes import DrivenPath, NotEvaluable, Runner, SavedModel, Task
+from sb3_chac.evaluation.episodes import DrivenPath, NotEvaluable, Runner, SavedModel, Task, control_of
 
 MOST_SCENARIOS = 100_000  # at once
 
@@ -152,14 +151,15 @@ def evaluate(
 
 def policy_name(policy: BaseAlgorithm | str | Callable[[Any], Any]) -> str:
     """
-    :return: what to call it; of a C-HAC model it says who acts, e.g. "CHAC (shared)"
+    Name a policy for tables and files.
+
+    :return: e.g. "SAC", "scripted", or with shared control which of its policies acts, "CHAC (shared)"
     """
     if isinstance(policy, str):
         return policy
     name = getattr(policy, "__name__", type(policy).__name__)
-    if isinstance(policy, CHAC):
-        return f"{name} ({'guided' if policy.stage == 1 else policy.policy.control})"
-    return name
+    control = control_of(policy)
+    return name if control is None else f"{name} ({'guided' if policy.policy.stage == 1 else control})"  # type: ignore[union-attr]
 
 
 def compare(evaluations: list[Evaluation]) -> str:
@@ -232,7 +232,7 @@ def saved_model(model: BaseAlgorithm) -> SavedModel:
     """
     archive = io.BytesIO()
     model.save(archive)
-    return SavedModel(type(model), archive.getvalue(), model.policy.control if isinstance(model, CHAC) else None)
+    return SavedModel(type(model), archive.getvalue(), control_of(model))
 
 
 _runner: Runner  # of a worker process

@@ -32,10 +32,10 @@ from sb3_chac.common.contract import (
     read_report,
     scaled,
 )
-from sb3_chac.common.episodes import Runner, SavedModel, Task, make_env
-from sb3_chac.common.evaluation import policy_name, saved_model, scenario_list
-from sb3_chac.human.dataset_writer import DatasetWriter, folder_to_make
-from sb3_chac.human.demonstrations import DatasetError, check_spaces
+from sb3_chac.common.demonstrations import DatasetError, check_spaces
+from sb3_chac.datasets.writer import DatasetWriter, folder_to_make
+from sb3_chac.evaluation.episodes import Runner, SavedModel, Task, make_env
+from sb3_chac.evaluation.evaluation import policy_name, saved_model, scenario_list
 from sb3_chac.human.intervention import InterventionWrapper
 
 if TYPE_CHECKING:

@@ -9,8 +9,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from sb3_chac.common.contract import TakeoverDisplay
-from sb3_chac.common.episodes import DrivenPath, NotEvaluable, Runner
-from sb3_chac.common.evaluation import Evaluation
+from sb3_chac.evaluation.episodes import DrivenPath, NotEvaluable, Runner
+from sb3_chac.evaluation.evaluation import Evaluation
 
 VIDEO_SUFFIXES = (".mp4", ".gif")
 PLOT_SUFFIXES = (".png", ".svg", ".pdf")

@@ -1,4 +1,4 @@
-"""Demonstrations: datasets in Minari's format (minari.farama.org) as flat arrays. ``human.recording`` makes such datasets."""
+"""Demonstrations: datasets in Minari's format (minari.farama.org) as flat arrays. ``datasets.recording`` makes some."""
 
 import json
 import os

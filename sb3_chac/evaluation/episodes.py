@@ -104,6 +104,16 @@ def check_names_no_code(value: Any, known: EnvSpec, source: str) -> None:
         )
 
 
+def control_of(policy: Any) -> str | None:
+    """
+    Tell which of its policies a model with shared control acts with.
+
+    :param policy: a model, or anything else that acts
+    :return: "guided", "self" or "shared" (see ``CHACPolicy``), None without shared control
+    """
+    return getattr(getattr(policy, "policy", None), "control", None)
+
+
 class SavedModel(NamedTuple):
     """A model on its way to another process. ``control`` is C-HAC's (``CHACPolicy``), which the archive does not hold."""
 

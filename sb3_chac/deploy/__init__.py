@@ -1,0 +1,1 @@
+"""Deployment: policies as ONNX files, and a runtime for them that needs neither torch nor Stable-Baselines3."""
