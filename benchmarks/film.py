@@ -7,6 +7,7 @@ risk rule; stage 2 is agents/chac-SafeDrive-v0.zip. Map and seed decide all that
 """
 
 import argparse
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ FPS, SIZE, COLOURS, CAPTION = 10, (480, 360), 64, 34
 MAPS = range(1000, 1050)
 BEFORE, LONGEST, AFTER, STAGE_2 = 20, 60, 15, 60  # steps that are shown
 
+SELF = "self-learning policy"  # as the display calls it
 NOVICE, HUMAN, HANDED_BACK = "A novice drives", "The human takes over: this teaches the novice", "The human hands back"
 
 
@@ -96,18 +98,34 @@ def film(env: InterventionWrapper, model: Any, number: int, start: int, end: int
 
 
 def self_learning() -> list[Image.Image]:
-    """Film a drive in stage 2: where the self-learning policy drives, and how sure it is."""
+    """Film a drive in stage 2, where the self-learning policy drives most: who drives, and how sure it is."""
     env = make_env()
     driver = ModelDriver(CHAC.load(HERE / "agents" / "chac-SafeDrive-v0.zip", device="cpu"), env, None)
-    observation, _ = env.reset(seed=0, options={"scenario": MAPS[0]})
+    shares = np.array([hud["drives"] == SELF for hud in stage_2(env, driver)], float)
+    start = int(np.convolve(shares, np.ones(STAGE_2), mode="valid").argmax())
     pictures = []
-    for step in range(BEFORE + STAGE_2):
-        observation, *_ = env.step(driver(observation))
-        env.unwrapped.hud = driver.hud  # type: ignore[attr-defined]
-        if step >= BEFORE:
-            text = "Stage 2: the self-learning policy drives where it is surely better"
-            pictures.append(caption(env.render(), text, (30, 80, 150)))  # type: ignore[arg-type]
+    for step, hud in enumerate(stage_2(env, driver)):
+        if start <= step < start + STAGE_2:
+            env.unwrapped.hud = hud  # type: ignore[attr-defined]
+            text = f"Stage 2: the {hud['drives']} drives, confidence {hud['confidence']}"
+            colour = (30, 80, 150) if hud["drives"] == SELF else (40, 110, 50)
+            pictures.append(caption(env.render(), text, colour))  # type: ignore[arg-type]
     return pictures
+
+
+def stage_2(env: gym.Env, driver: ModelDriver) -> Iterator[dict[str, Any]]:
+    """
+    Drive the first test map.
+
+    :return: what the display tells of each step
+    """
+    observation, _ = env.reset(seed=0, options={"scenario": MAPS[0]})
+    driver.reset()
+    done = False
+    while not done:
+        observation, _, terminated, truncated, _ = env.step(driver(observation))
+        done = terminated or truncated
+        yield driver.hud
 
 
 def save(pictures: list[Image.Image], path: Path) -> None:

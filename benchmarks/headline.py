@@ -9,12 +9,12 @@ one of its method; the figures are those at the step that all others have reache
 """
 
 import argparse
-import csv
 import re
 import sys
 from pathlib import Path
 
 import numpy as np
+from guidance_curves import COLUMNS, load_run, read
 
 from sb3_chac.evaluation import curves
 from sb3_chac.evaluation.curves import Curves, Method
@@ -25,27 +25,6 @@ WITH, WITHOUT = HERE / "results" / "guidance", HERE / "results" / "guidance-with
 BEGIN, END = "<!-- headline: made by benchmarks/headline.py -->", "<!-- end of headline -->"
 METHODS = {"sac": "SAC", "dsac": "DSAC", "pvp": "PVP", "dpvp": "D-PVP", "chac": "C-HAC"}
 STAGE_1 = {"chac": "chac-stage-1"}  # the method whose runs it goes on from
-COLUMNS = {
-    "return_mean": curves.RETURN,
-    "success_rate": curves.SUCCESS,
-    "cost_mean": curves.COST,
-    "training_cost": curves.TRAINING_COST,
-    "human_steps": curves.HUMAN_STEPS,
-}
-
-
-def read(path: Path) -> list[dict[str, str]]:
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
-
-
-def to_curves(rows: list[dict[str, str]], stage: int) -> Curves:
-    """
-    :param rows: of a CSV of guidance.py
-    """
-    steps = [float(row["step"]) for row in rows]
-    found = {name: np.column_stack([steps, [float(row[key]) for row in rows]]) for key, name in COLUMNS.items()}
-    return found | {curves.STAGE: np.column_stack([steps, [stage] * len(steps)])}
 
 
 def load(folder: Path, name: str) -> tuple[list[Curves], int]:
@@ -53,15 +32,10 @@ def load(folder: Path, name: str) -> tuple[list[Curves], int]:
     :param name: of a method in guidance.py
     :return: its runs, cut where the shortest of them ends, stage 1 before stage 2; and the number of maps of an evaluation
     """
-    runs, maps = [], 0
-    for path in sorted(path for path in folder.glob("*.csv") if re.fullmatch(rf"{name}-\d+", path.stem)):
-        rows = read(path)
-        run = to_curves(rows, 2 if name in STAGE_1 else 1)
-        if name in STAGE_1:
-            before = read(path.with_name(path.name.replace(name, STAGE_1[name], 1)))
-            run = curves.join_curves(to_curves(before, 1), run)
-        runs.append(run)
-        maps = int(rows[-1]["episodes"])
+    paths = [path for path in folder.glob("*.csv") if re.fullmatch(rf"{name}-\d+", path.stem)]
+    seeds = sorted(int(path.stem.rpartition("-")[2]) for path in paths)
+    runs = [load_run(folder, name, seed, STAGE_1.get(name)) for seed in seeds]
+    maps = int(read(paths[0])[-1]["episodes"]) if paths else 0
     ends = [run[curves.RETURN][-1, 0] for run in runs]
     runs = [run for run, end in zip(runs, ends, strict=True) if end >= max(ends) / 2]
     end = min((run[curves.RETURN][-1, 0] for run in runs), default=0)
