@@ -25,7 +25,7 @@ class BCPolicy(BasePolicy):
     :param action_space: Action space
     :param lr_schedule: Learning rate schedule
     :param stochastic: whether to give a standard deviation; without, it acts deterministically. Set by BC's ``loss``
-    :param net_arch: Hidden layers, [256, 256] by default
+    :param net_arch: Hidden layers, [256, 256] by default; or a dict that has them as "pi"
     :param activation_fn: Activation function
     :param features_extractor_class: Features extractor to use, by default the one that fits the observations
     :param features_extractor_kwargs: Keyword arguments of the features extractor
@@ -43,7 +43,7 @@ class BCPolicy(BasePolicy):
         action_space: spaces.Box | spaces.Discrete,
         lr_schedule: Schedule,
         stochastic: bool = False,
-        net_arch: list[int] | None = None,
+        net_arch: list[int] | dict[str, list[int]] | None = None,
         activation_fn: type[nn.Module] = nn.ReLU,
         features_extractor_class: type[BaseFeaturesExtractor] | None = None,
         features_extractor_kwargs: dict[str, Any] | None = None,
@@ -62,7 +62,7 @@ class BCPolicy(BasePolicy):
             squash_output=isinstance(action_space, spaces.Box),  # predict() scales the actions back
         )
         self.stochastic = stochastic
-        self.net_arch = [256, 256] if net_arch is None else net_arch
+        self.net_arch = [256, 256] if net_arch is None else net_arch["pi"] if isinstance(net_arch, dict) else net_arch
         self.activation_fn = activation_fn
         self.features_extractor = self.make_features_extractor()
         features_dim = self.features_extractor.features_dim

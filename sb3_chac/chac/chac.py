@@ -311,7 +311,7 @@ class CHAC(DPVP):
             return super()._gradient_step(batch) | self._update_confidence_critic(batch)
         stats = self._update_confidence_critic(batch)
         if self._n_updates % self.policy_delay == 0:
-            ent_coef = self.log_ent_coef.detach().exp()
+            ent_coef = self._current_ent_coef()
             with th.no_grad():
                 guided_actions = self.actor(batch.observations, deterministic=True)
             stats |= self._update_actor(
@@ -328,7 +328,7 @@ class CHAC(DPVP):
 
     def _update_confidence_critic(self, batch: DualReplayBufferSamples) -> dict[str, th.Tensor]:
         """Z_c evaluates, with reward, what is executed."""
-        ent_coef = self.log_ent_coef.detach().exp()
+        ent_coef = self._current_ent_coef()
         rewards, target = self._confidence_rewards(batch), self.confidence_critic_target
         if self.stage == 1:
             targets = self._return_targets(self.actor_target, target, batch, rewards, ent_coef)

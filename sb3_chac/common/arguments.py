@@ -112,6 +112,97 @@ def check_argument(name: str, value: Any, hint: Any) -> None:
         raise ValueError(f"train_freq must count in 'step' or 'episode', got {value!r}.")
 
 
+NETWORKS = ("pi", "qf", "vf")  # actor, critic of actions, critic of states
+
+
+def check_policy_kwargs(name: str, owner: type, kwargs: dict[str, Any] | None, networks: tuple[str, ...] = ("pi",)) -> None:
+    """
+    :param name: of the argument ("policy_kwargs"), for the message
+    :param owner: class that the keyword arguments are for
+    :param kwargs: to be checked
+    :param networks: that have hidden layers of their own if ``net_arch`` is a dict, of ``NETWORKS``
+    :raises ValueError: for one that ``owner`` does not take, or that is none of what its signature says; names it
+    """
+    kwargs = kwargs or {}
+    hints, defaults = keywords(owner)
+    if "vf" in networks:
+        hints.pop("use_sde", None)  # SB3's PPO hands it over by itself
+    for key, value in kwargs.items():
+        check_keyword(name, owner, key, hints)
+        if key == "net_arch":
+            check_net_arch(name, value, networks)
+        elif not fits(value, hints[key]):
+            raise ValueError(f"{name}: {key} must be {describe(hints[key])}, got {value!r:.80}.")
+    if kwargs.get("n_critics", 1) < 1:
+        raise ValueError(f"{name}: n_critics must be an integer of at least 1, got {kwargs['n_critics']!r}.")
+    for part, given in (("features_extractor", "observation_space"), ("optimizer", "lr")):
+        default = defaults.get(f"{part}_class") or getattr(owner, f"default_{part}", None)
+        part_owner = kwargs.get(f"{part}_class") or default
+        if isinstance(part_owner, type):
+            parameters, _ = keywords(part_owner)
+            parameters.pop(given, None)
+            for key in kwargs.get(f"{part}_kwargs") or {}:
+                check_keyword(f"{name}: {part}_kwargs", part_owner, key, parameters)
+
+
+def check_keyword(name: str, owner: type, key: str, hints: dict[str, Any]) -> None:
+    """
+    :param hints: the keyword arguments that ``owner`` takes
+    :raises ValueError: unless ``key`` is one of them
+    """
+    if key not in hints:
+        known = ", ".join(sorted(hints)) or "none"
+        raise ValueError(f"{name}: {key!r} is no argument of {owner.__name__}, which has {known}.")
+
+
+def check_net_arch(name: str, value: Any, networks: tuple[str, ...]) -> None:
+    """
+    :param name: of the argument that holds it
+    :param value: the sizes of the hidden layers, or of those of each network
+    :param networks: that there are: of an actor alone what a dict says of critics is ignored, PPO's may leave one out
+    :raises ValueError: unless the sizes are integers of at least 1, and networks have the names that they have
+    """
+    if "vf" in networks and isinstance(value, list) and len(value) == 1 and isinstance(value[0], dict):
+        value = value[0]  # SB3's former spelling, which it still takes, with a warning
+    layers, named = [value], True
+    if isinstance(value, dict):
+        layers = list(value.values())
+        allowed, needed = (NETWORKS if networks == ("pi",) else networks), (() if "vf" in networks else networks)
+        named = set(needed) <= set(value) <= set(allowed)
+    sized = all(isinstance(sizes, list) and all(fits(size, int) and size > 0 for size in sizes) for sizes in layers)
+    if value is not None and not (named and sized):
+        example = ", ".join(f"{key}=[64, 64]" for key in networks)
+        raise ValueError(
+            f"{name}: net_arch must be a list of layer sizes such as [64, 64], or dict({example}), got {value!r:.80}."
+        )
+
+
+def keywords(owner: type) -> tuple[dict[str, Any], dict[str, Any]]:
+    """
+    :return: annotations and defaults of the keyword arguments of a class, by name: also of those that it hands on to its bases
+    """
+    found: dict[str, Any] = {}
+    defaults: dict[str, Any] = {}
+    for base in owner.__mro__:
+        if "__init__" not in vars(base):
+            continue
+        parameters = list(inspect.signature(vars(base)["__init__"]).parameters.values())[1:]
+        try:
+            hints = typing.get_type_hints(vars(base)["__init__"])
+        except (NameError, TypeError):  # a user's class, whose annotations name what is not there
+            hints = {}
+        for parameter in parameters:
+            if parameter.kind not in (parameter.VAR_KEYWORD, parameter.VAR_POSITIONAL):
+                found.setdefault(parameter.name, hints.get(parameter.name, Any))
+                defaults.setdefault(parameter.name, parameter.default)
+        if all(parameter.kind is not parameter.VAR_KEYWORD for parameter in parameters):
+            break
+    return {key: hint for key, hint in found.items() if key not in GIVEN}, defaults
+
+
+GIVEN = ("observation_space", "action_space", "lr_schedule")  # to policies, by the algorithms
+
+
 def ends_of_schedule(name: str, schedule: Callable[[float], Any]) -> tuple[float, float]:
     """
     :param name: of the argument

@@ -1,6 +1,6 @@
 import io
 import pathlib
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
@@ -13,6 +13,7 @@ from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, TensorDict
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_chac.common.arguments import check_policy_kwargs
 from sb3_chac.common.checks import (
     MismatchedParameters,
     check_action_space,
@@ -34,6 +35,8 @@ class CheckedOffPolicyAlgorithm(OffPolicyAlgorithm):
 
     # What ``policy`` must derive from
     required_policy: type[BasePolicy]
+    # That it has, see ``check_policy_kwargs``
+    networks: ClassVar[tuple[str, ...]] = ("pi", "qf")
 
     def _setup_model(self) -> None:
         self._check_arguments()
@@ -50,6 +53,7 @@ class CheckedOffPolicyAlgorithm(OffPolicyAlgorithm):
                 f"policy: {type(self).__name__} needs a {self.required_policy.__name__}, got {self.policy_class.__name__} "
                 f"(of {self.policy_class.__module__}). If it came from a checkpoint, load that with the class that saved it."
             )
+        check_policy_kwargs("policy_kwargs", self.policy_class, self.policy_kwargs, self.networks)
         check_learning_rate("learning_rate", self.learning_rate)
         check_integer("buffer_size", self.buffer_size, low=1)
         check_integer("batch_size", self.batch_size, low=1)

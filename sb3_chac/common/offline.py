@@ -3,7 +3,7 @@
 import sys
 import time
 from collections import defaultdict
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import numpy as np
 import torch as th
@@ -14,6 +14,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_chac.common.arguments import check_policy_kwargs
 from sb3_chac.common.checks import check_action_space, check_integer, check_learning_rate, check_range
 from sb3_chac.common.demonstrations import Dataset, Demonstrations, check_spaces, load_demonstrations, missing_dataset
 from sb3_chac.common.utils import fix_statistics
@@ -105,6 +106,8 @@ class OfflineAlgorithm(BaseAlgorithm):
 
     # What ``policy`` must derive from
     required_policy: type[BasePolicy]
+    # That it has, see ``check_policy_kwargs``
+    networks: ClassVar[tuple[str, ...]] = ("pi",)
 
     def __init__(
         self,
@@ -160,6 +163,7 @@ class OfflineAlgorithm(BaseAlgorithm):
                 f"policy: {type(self).__name__} needs a {self.required_policy.__name__}, got {self.policy_class.__name__} "
                 f"(of {self.policy_class.__module__}). If it came from a checkpoint, load that with the class that saved it."
             )
+        check_policy_kwargs("policy_kwargs", self.policy_class, self.policy_kwargs, self.networks)
         check_learning_rate("learning_rate", self.learning_rate)
         check_integer("batch_size", self.batch_size, low=1)
         check_range("validation_share", self.validation_share, low=0.0, high=0.9)

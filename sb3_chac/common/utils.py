@@ -1,5 +1,6 @@
 """Small tensor helpers shared by the algorithms."""
 
+import math
 import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -126,6 +127,15 @@ def target_entropy(argument: str | float, n_actions: int) -> float:
     if matched is None:
         raise ValueError(f"target_entropy must be a number, 'auto' or such as 'auto_8' (-8 per action), got {argument!r}.")
     return -float(matched[1] or 1) * n_actions
+
+
+def safe_log(value: float) -> float:
+    """
+    Return a finite logarithm, also of 0 and of what 32 bits cannot hold.
+
+    :param value: of at least 0
+    """
+    return math.log(max(value, float(th.finfo(th.float32).tiny)))
 
 
 def initial_ent_coef(ent_coef: str | float) -> float:

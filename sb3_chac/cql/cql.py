@@ -1,9 +1,9 @@
 import math
 from typing import Any, ClassVar, TypeVar
 
-import numpy as np
 import torch as th
 from stable_baselines3.common.policies import BasePolicy, ContinuousCritic
+from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import FloatSchedule, update_learning_rate
 from stable_baselines3.common.vec_env import VecEnv
@@ -13,7 +13,15 @@ from sb3_chac.common.arguments import checked
 from sb3_chac.common.checks import check_action_space, check_integer, check_learning_rate, check_range
 from sb3_chac.common.demonstrations import Dataset
 from sb3_chac.common.offline import Batch, OfflineAlgorithm
-from sb3_chac.common.utils import TargetUpdate, detach_distributions, frozen, initial_ent_coef, minimize
+from sb3_chac.common.utils import (
+    TargetUpdate,
+    detach_distributions,
+    frozen,
+    initial_ent_coef,
+    minimize,
+    safe_log,
+    target_entropy,
+)
 from sb3_chac.cql.policies import CnnPolicy, CQLPolicy, MlpPolicy
 
 SelfCQL = TypeVar("SelfCQL", bound="CQL")
@@ -55,7 +63,7 @@ class CQL(OfflineAlgorithm):
     :param gamma: the discount factor
     :param ent_coef: Entropy regularization coefficient alpha. Set it to 'auto' to learn it
         (and 'auto_0.1' for using 0.1 as initial value)
-    :param target_entropy: target entropy when learning ``ent_coef``, 'auto' is minus the number of actions
+    :param target_entropy: target entropy when learning ``ent_coef``, "auto" is -1 per action, "auto_8" -8 per action
     :param actor_lr: learning rate of the actor and the entropy coefficient, can be a schedule too
     :param entropy_backup: whether the target of Q holds ``-alpha log pi(a'|s')``, as in SAC
     :param conservative_weight: weight of the gap; where it starts in the Lagrange form
@@ -77,6 +85,7 @@ class CQL(OfflineAlgorithm):
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": MlpPolicy, "CnnPolicy": CnnPolicy}
     required_policy = CQLPolicy
+    networks: ClassVar[tuple[str, ...]] = ("pi", "qf")
     policy: CQLPolicy
     actor: Actor
     critic: ContinuousCritic
@@ -148,13 +157,15 @@ class CQL(OfflineAlgorithm):
         self.actor, self.critic, self.critic_target = self.policy.actor, self.policy.critic, self.policy.critic_target
         self.target_update = TargetUpdate(self.critic, self.critic_target)
         self.actor_lr_schedule = FloatSchedule(self.actor_lr)
-        if self.target_entropy == "auto":
-            self.target_entropy = -float(np.prod(self.action_space.shape))  # type: ignore[arg-type]
+        self.target_entropy = target_entropy(self.target_entropy, get_action_dim(self.action_space))
 
         learn_ent_coef, learn_weight = isinstance(self.ent_coef, str), self.lagrange_threshold is not None
+        initial = initial_ent_coef(self.ent_coef)
         with th.no_grad():
-            self.policy.log_ent_coef.fill_(initial_ent_coef(self.ent_coef)).log_()
-            self.policy.log_conservative_weight.fill_(self.conservative_weight).log_()
+            self.policy.log_ent_coef.fill_(safe_log(initial))
+            self.policy.log_conservative_weight.fill_(safe_log(self.conservative_weight))
+        self.ent_coef_tensor = th.full((1,), initial, device=self.device)  # the fixed one
+        self.log_ent_coef = self.policy.log_ent_coef if learn_ent_coef else None  # as in SB3
         self.policy.log_ent_coef.requires_grad_(learn_ent_coef)
         self.policy.log_conservative_weight.requires_grad_(learn_weight)
         if learn_ent_coef:
@@ -175,8 +186,7 @@ class CQL(OfflineAlgorithm):
         check_range("temperature", self.temperature, low=0.0, exclusive_low=True)
         if self.lagrange_threshold is not None:
             check_range("lagrange_threshold", self.lagrange_threshold, low=0.0, exclusive_low=True)
-        if self.target_entropy != "auto":
-            check_range("target_entropy", self.target_entropy)
+        target_entropy(self.target_entropy, get_action_dim(self.action_space))
         initial_ent_coef(self.ent_coef)
 
     def _optimizers(self) -> list[th.optim.Optimizer]:
@@ -188,7 +198,7 @@ class CQL(OfflineAlgorithm):
             update_learning_rate(optimizer, self.actor_lr_schedule(self._current_progress_remaining))
 
     def _gradient_step(self, batch: Batch) -> dict[str, th.Tensor]:
-        ent_coef = self.policy.log_ent_coef.detach().exp()
+        ent_coef = self.ent_coef_tensor if self.log_ent_coef is None else self.log_ent_coef.detach().exp()
         stats = self._update_critic(batch, ent_coef) | self._update_actor(batch, ent_coef)
         self.target_update(self.tau)
         detach_distributions(self.policy)
@@ -200,7 +210,10 @@ class CQL(OfflineAlgorithm):
         bellman_loss = 0.5 * (q_values - targets.unsqueeze(1)).square().mean(dim=0).sum()
         sampled_q_values, log_densities = self._sampled_q_values(batch)
         gaps = conservative_gap(sampled_q_values, log_densities, q_values.t(), self.temperature).mean(dim=1)
-        weight = self.policy.log_conservative_weight.detach().exp()
+        if self.lagrange_optimizer is None:
+            weight = th.full((1,), self.conservative_weight, device=self.device)
+        else:
+            weight = self.policy.log_conservative_weight.detach().exp()
         minimize(bellman_loss + (weight * gaps).sum(), self.critic.optimizer)
         if self.lagrange_optimizer is not None:
             assert self.lagrange_threshold is not None
@@ -279,7 +292,8 @@ class CQL(OfflineAlgorithm):
 
     def _excluded_save_params(self) -> list[str]:
         # Aliases of what the policy holds
-        return [*super()._excluded_save_params(), "actor", "critic", "critic_target", "target_update"]
+        aliases = ["actor", "critic", "critic_target", "log_ent_coef"]
+        return [*super()._excluded_save_params(), *aliases, "ent_coef_tensor", "target_update"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         optimizers = [name for name in ("ent_coef_optimizer", "lagrange_optimizer") if getattr(self, name) is not None]

@@ -1,9 +1,8 @@
-from typing import ClassVar
-
 import torch as th
 from stable_baselines3.common.policies import ContinuousCritic
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, NatureCNN
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import Schedule
+from stable_baselines3.sac import policies as sac
 from stable_baselines3.sac.policies import Actor, SACPolicy
 from torch import nn
 
@@ -37,7 +36,5 @@ class CQLPolicy(SACPolicy):
 MlpPolicy = CQLPolicy
 
 
-class CnnPolicy(CQLPolicy):
+class CnnPolicy(CQLPolicy, sac.CnnPolicy):
     """Policy for image observations: ``CQLPolicy`` with the CNN of the DQN Nature paper as features extractor."""
-
-    default_features_extractor: ClassVar[type[BaseFeaturesExtractor]] = NatureCNN

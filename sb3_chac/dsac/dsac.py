@@ -22,6 +22,7 @@ from sb3_chac.common.utils import (
     frozen,
     initial_ent_coef,
     minimize,
+    safe_log,
     target_entropy,
 )
 from sb3_chac.dsac.policies import CnnPolicy, DSACPolicy, MlpPolicy, MultiInputPolicy
@@ -112,7 +113,7 @@ class DSAC(CheckedOffPolicyAlgorithm):
     actor_target: Actor
     critic: DistributionalCritic
     critic_target: DistributionalCritic
-    log_ent_coef: th.nn.Parameter
+    log_ent_coef: th.nn.Parameter | None  # None for a fixed coefficient, as in SB3
 
     @checked
     def __init__(
@@ -201,12 +202,21 @@ class DSAC(CheckedOffPolicyAlgorithm):
 
         self.target_entropy = target_entropy(self.target_entropy, get_action_dim(self.action_space))
 
-        learn_ent_coef = isinstance(self.ent_coef, str)
+        initial = initial_ent_coef(self.ent_coef)
+        parameter = self.policy.log_ent_coef
         with th.no_grad():
-            self.log_ent_coef.fill_(initial_ent_coef(self.ent_coef)).log_()
-        self.log_ent_coef.requires_grad_(learn_ent_coef)
-        if learn_ent_coef:
-            self.ent_coef_optimizer = th.optim.Adam([self.log_ent_coef], lr=self.ent_coef_lr_schedule(1.0), fused=True)
+            parameter.fill_(safe_log(initial))
+        self.ent_coef_tensor = th.full((1,), initial, device=self.device)  # the fixed one
+        self.log_ent_coef = parameter if isinstance(self.ent_coef, str) else None
+        parameter.requires_grad_(self.log_ent_coef is not None)
+        if self.log_ent_coef is not None:
+            self.ent_coef_optimizer = th.optim.Adam([parameter], lr=self.ent_coef_lr_schedule(1.0), fused=True)
+
+    def _current_ent_coef(self) -> th.Tensor:
+        """
+        :return: alpha, shape (1,)
+        """
+        return self.ent_coef_tensor if self.log_ent_coef is None else self.log_ent_coef.detach().exp()
 
     def _optimizers(self) -> list[th.optim.Optimizer]:
         """Those that follow ``learning_rate``."""
@@ -217,7 +227,6 @@ class DSAC(CheckedOffPolicyAlgorithm):
         self.actor_target = self.policy.actor_target
         self.critic = self.policy.critic
         self.critic_target = self.policy.critic_target
-        self.log_ent_coef = self.policy.log_ent_coef
 
     def _check_arguments(self) -> None:
         super()._check_arguments()
@@ -261,7 +270,7 @@ class DSAC(CheckedOffPolicyAlgorithm):
         :param batch: from the replay buffer
         :return: what to log, scalars
         """
-        ent_coef = self.log_ent_coef.detach().exp()
+        ent_coef = self._current_ent_coef()
         stats = self._update_critic(batch, ent_coef)
         if self._n_updates % self.policy_delay == 0:
             stats |= self._update_policy(batch, ent_coef)
@@ -335,7 +344,7 @@ class DSAC(CheckedOffPolicyAlgorithm):
                 actor_loss = actor_loss + penalty(actions).mean()
             minimize(actor_loss, actor.optimizer)
         entropy = -log_prob.detach().mean()
-        if self.ent_coef_optimizer is not None:
+        if self.ent_coef_optimizer is not None and self.log_ent_coef is not None:
             minimize((self.log_ent_coef * (entropy - float(self.target_entropy))).mean(), self.ent_coef_optimizer)
         return {"actor_loss": actor_loss.detach(), "entropy": entropy, "ent_coef": ent_coef.squeeze()}
 
@@ -352,7 +361,7 @@ class DSAC(CheckedOffPolicyAlgorithm):
 
     def _excluded_save_params(self) -> list[str]:
         # Aliases of what the policy holds
-        aliases = ["actor", "actor_target", "critic", "critic_target", "log_ent_coef"]
+        aliases = ["actor", "actor_target", "critic", "critic_target", "log_ent_coef", "ent_coef_tensor"]
         return [*super()._excluded_save_params(), *aliases, "target_updates"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:

@@ -13,7 +13,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.utils import FloatSchedule, obs_as_tensor, update_learning_rate
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_chac.common.arguments import checked
+from sb3_chac.common.arguments import check_policy_kwargs, checked
 from sb3_chac.common.checked_rollouts import CheckedRollouts
 from sb3_chac.common.checks import check_action_space, check_integer, check_learning_rate, check_range
 from sb3_chac.common.demonstrations import Dataset, Demonstrations, check_spaces, load_demonstrations, missing_dataset
@@ -180,6 +180,8 @@ class GAIL(CheckedRollouts, PPO):
         """
         :raises ValueError: names the argument and the remedy
         """
+        check_policy_kwargs("policy_kwargs", self.policy_class, self.policy_kwargs, ("pi", "vf"))
+        check_policy_kwargs("disc_kwargs", Discriminator, self.disc_kwargs)
         check_learning_rate("learning_rate", self.learning_rate)
         check_learning_rate("disc_learning_rate", self.disc_learning_rate)
         check_integer("n_disc_updates", self.n_disc_updates, low=1)

@@ -72,6 +72,7 @@ class HGDagger(GuidedOffPolicyAlgorithm):
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": MlpPolicy, "CnnPolicy": CnnPolicy}
     required_policy = BCPolicy
+    networks: ClassVar[tuple[str, ...]] = ("pi",)
     policy: BCPolicy
 
     @checked

@@ -13,7 +13,7 @@ from stable_baselines3.common.utils import explained_variance, obs_as_tensor
 from stable_baselines3.common.vec_env import VecEnv
 from torch.nn import functional as F
 
-from sb3_chac.common.arguments import checked
+from sb3_chac.common.arguments import check_policy_kwargs, checked
 from sb3_chac.common.checked_rollouts import CheckedRollouts
 from sb3_chac.common.checks import check_learning_rate, check_range
 from sb3_chac.common.lagrange import CostConstrainedAlgorithm, constrained_advantages
@@ -197,6 +197,7 @@ class PPOLag(CostConstrainedAlgorithm, CheckedRollouts, PPO):
                 f"rollout_buffer_class must derive from CostRolloutBuffer, got {self.rollout_buffer_class.__name__}: "
                 "PPOLag stores costs. Leave it out to get the default."
             )
+        check_policy_kwargs("policy_kwargs", self.policy_class, self.policy_kwargs, ("pi", "vf"))
         check_learning_rate("learning_rate", self.learning_rate)
         check_range("cost_gae_lambda", self.cost_gae_lambda, low=0.0, high=1.0)
         check_range("cost_vf_coef", self.cost_vf_coef, low=0.0)

@@ -163,7 +163,8 @@ class PVP(GuidedOffPolicyAlgorithm, TD3):
 
             # Delayed policy updates
             if self._n_updates % self.policy_delay == 0:
-                with frozen(self.critic.parameters()):
+                actors = {id(parameter) for parameter in self.actor.parameters()}  # a shared features extractor is its own
+                with frozen(parameter for parameter in self.critic.parameters() if id(parameter) not in actors):
                     actions = self.actor(batch.observations)
                     actor_loss = -self.critic.q1_forward(batch.observations, actions).mean()  # type: ignore[arg-type]
                     minimize(actor_loss, self.actor.optimizer)

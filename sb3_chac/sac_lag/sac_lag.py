@@ -10,13 +10,14 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy, ContinuousCritic
+from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 
 from sb3_chac.common.arguments import checked
-from sb3_chac.common.checks import check_integer, check_range
+from sb3_chac.common.checks import check_integer
 from sb3_chac.common.lagrange import CostConstrainedAlgorithm, constrained_actor_loss
 from sb3_chac.common.off_policy_algorithm import CheckedOffPolicyAlgorithm
-from sb3_chac.common.utils import TargetUpdate, detach_distributions, frozen, initial_ent_coef, minimize
+from sb3_chac.common.utils import TargetUpdate, detach_distributions, frozen, initial_ent_coef, minimize, target_entropy
 from sb3_chac.sac_lag.buffers import CostNStepReplayBuffer, CostReplayBuffer, CostReplayBufferSamples, default_buffer_class
 from sb3_chac.sac_lag.policies import CnnPolicy, MlpPolicy, MultiInputPolicy, SACLagPolicy
 
@@ -63,7 +64,7 @@ class SACLag(CostConstrainedAlgorithm, CheckedOffPolicyAlgorithm, SAC):
     :param ent_coef: Entropy regularization coefficient alpha. Set it to 'auto' to learn it
         (and 'auto_0.1' for using 0.1 as initial value)
     :param target_update_interval: update the target networks every ``target_update_interval`` gradient steps
-    :param target_entropy: target entropy when learning ``ent_coef``, 'auto' is minus the number of actions
+    :param target_entropy: target entropy when learning ``ent_coef``, "auto" is -1 per action, "auto_8" -8 per action
     :param cost_limit: that the mean cost of an episode is to stay below
     :param cost_gamma: the discount factor of costs; ``gamma`` if None
     :param lagrange_start: how many steps of the model to leave the multiplier as it is for
@@ -186,6 +187,7 @@ class SACLag(CostConstrainedAlgorithm, CheckedOffPolicyAlgorithm, SAC):
         self._check_arguments()  # before the buffer is chosen by them
         self._setup_constraint()
         self._choose_replay_buffer()
+        self.target_entropy = target_entropy(self.target_entropy, get_action_dim(self.action_space))
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", message="`n_steps=")  # our buffer has got it
             super()._setup_model()
@@ -216,8 +218,7 @@ class SACLag(CostConstrainedAlgorithm, CheckedOffPolicyAlgorithm, SAC):
         check_integer("target_update_interval", self.target_update_interval, low=1)
         check_integer("lagrange_start", self.lagrange_start, low=0)
         initial_ent_coef(self.ent_coef)
-        if self.target_entropy != "auto":
-            check_range("target_entropy", self.target_entropy)
+        target_entropy(self.target_entropy, get_action_dim(self.action_space))
 
     def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
         """
