@@ -62,10 +62,10 @@ def test_over_the_humans_steps(runs, tmp_path, capsys):
 
 def test_labels_and_resumed_runs(tmp_path):
     first = make_run(tmp_path / "chac" / "Toy-v0_1", [1, 2, 3])
-    second = make_run(tmp_path / "chac" / "Toy-v0_2", [7, 8], start=1000)
+    second = make_run(tmp_path / "chac" / "Toy-v0_2", [7, 8], start=1500)
     (method,) = compare.read([f"anchor 5={first}+{second}"])
     assert method.title == "anchor 5" and method.label == "anchor 5 (1 seed)"
-    assert method.runs[0]["return"].tolist() == [[1000, 1], [2000, 7], [3000, 8]]
+    assert method.runs[0]["return"].tolist() == [[1000, 1], [2000, 2], [2500, 7], [3500, 8]]
 
 
 @pytest.mark.parametrize("names, message", [((0, 0), "named twice"), ((0, 4), "different environments"), ((5,), "no folder")])

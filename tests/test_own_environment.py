@@ -2,17 +2,21 @@
 
 import sys
 import warnings
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
 import pytest
 from guided_toys import make_guided
+from shell import run
 from takeover_toys import EXPERT, NOVICE, Integrator, armed, bits, drive
+from test_documentation import blocks
 
 from sb3_chac import CHAC, __main__, chac
 from sb3_chac.evaluation.episodes import NotEvaluable, Runner, Task
 from sb3_chac.human import InterventionWrapper
 
+PAGE = Path(__file__).parent.parent / "docs" / "guide" / "custom_env.md"
 MODULE = """
 import math
 
@@ -127,3 +131,18 @@ def test_a_stage_2_without_the_self_learning_policy_says_so(monkeypatch):
         warnings.simplefilter("error")
         model.learn(20, reset_num_timesteps=False)  # once is enough
         make_guided(CHAC, switch_after=20, sigma_scale=1e6, delta=0.0).learn(45)  # as asked for
+
+
+@pytest.mark.slow
+def test_the_commands_of_the_page(tmp_path):
+    module, yaml = blocks(PAGE)[0], PAGE.read_text(encoding="utf-8").split("```yaml\n")[1].split("```")[0]
+    (tmp_path / "point.py").write_text(module)
+    (tmp_path / "point.yml").write_text(yaml)
+    scripts = Path(sys.executable).parent
+    small = ["-n", "400", "-params", "switch_after:300", "prefit_steps:10", "--eval-freq", "200"]
+    train = ["train", "--algo", "chac", "--env", "Point-v0", "--gym-packages", "point", "--conf-file", "point.yml"]
+    run(scripts / "rl_zoo3", *train, *small, "-f", "logs", cwd=tmp_path)
+    model = "logs/chac/Point-v0_1/Point-v0.zip"
+    evaluate = [scripts / "sb3-chac", "evaluate", model, "--env", "Point-v0", "--gym-packages", "point"]
+    output = run(*evaluate, "--scenarios", "1000:1004", "--beside", "guided", "point:around", "--jobs", "2", cwd=tmp_path)
+    assert "point:around" in output and "success" in output
