@@ -11,6 +11,7 @@ ROOT = Path(__file__).parent.parent
 # Module -> what installs it, where that is called otherwise or several do
 DISTRIBUTIONS = {
     "PIL": "pillow",
+    "huggingface_sb3": "sb3-team-hf-integration",
     "yaml": "pyyaml",
     "pygame": "pygame-ce",  # MetaDrive's pygame goes to the same folder
     "metadrive": "metadrive-simulator",
@@ -55,8 +56,8 @@ def test_all_imported_packages_are_declared():
 
 
 def test_what_is_declared_for_an_import_brings_it():
-    for name in ("numpy", "torch", "rliable", "matplotlib", "imageio", "rl_zoo3", "highway_env", "huggingface_sb3"):
-        assert normal(name) in map(normal, importlib.metadata.packages_distributions()[name])
+    for name in ("numpy", "torch", "rliable", "matplotlib", "imageio", "rl_zoo3", "highway_env", "huggingface_sb3", "PIL"):
+        assert normal(DISTRIBUTIONS.get(name, name)) in map(normal, importlib.metadata.packages_distributions()[name])
 
 
 def test_no_message_names_an_installation_that_does_not_exist():
