@@ -27,6 +27,11 @@ def make_run(folder: Path, returns: list[float], human: bool = False, start: int
     return str(folder)
 
 
+@pytest.fixture(autouse=True)
+def few_resamples(monkeypatch):
+    monkeypatch.setattr(curves, "RESAMPLES", 60)
+
+
 @pytest.fixture
 def runs(tmp_path):
     guided = [make_run(tmp_path / "chac" / f"SafeDrive-v0_{n}", [n, 10 + n, 20 + n, 30 + n], human=True) for n in (1, 2, 3)]

@@ -260,14 +260,15 @@ def improvements(methods: Sequence[Method], quantity: str = RETURN) -> Table:
     """
     :return: probability that a run of the row's method ends above one of the column's
     """
-    rows = [[f"P(above), {TITLES[quantity]}", *(method.title for method in methods)]]
-    for one in methods:
-        cells = []
-        for other in methods:
-            score = None if one is other else probability_of_improvement(finals(one, quantity), finals(other, quantity))
-            cells.append(score.text(2) if score else "")
-        rows.append([one.title, *cells])
-    return rows
+    cells = [["" for _ in methods] for _ in methods]
+    for row, one in enumerate(methods):
+        for column, other in enumerate(methods[:row]):
+            score = probability_of_improvement(finals(one, quantity), finals(other, quantity))
+            if score is not None:
+                cells[row][column] = score.text(2)
+                cells[column][row] = Score(*(1 - value for value in (score.value, score.high, score.low))).text(2)
+    header = [f"P(above), {TITLES[quantity]}", *(method.title for method in methods)]
+    return [header, *([method.title, *texts] for method, texts in zip(methods, cells, strict=True))]
 
 
 def markdown(table: Table) -> str:
