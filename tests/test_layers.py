@@ -21,7 +21,8 @@ LAYERS = (
     {"datasets"},
     {"deploy"},
     {"cockpit"},
-    {"cli", "evaluate", "drive", "resume", "plot", "demos"},
+    {"evaluate", "drive", "resume", "plot", "demos"},
+    {"compare"},  # reads runs as plot does
     {"__main__", "_startup"},
 )
 PARENTS = {"dpvp": {"dsac"}, "chac": {"dpvp"}, "hg_dagger": {"bc"}, "iwr": {"hg_dagger", "bc"}}  # an algorithm derives from it
