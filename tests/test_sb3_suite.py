@@ -40,6 +40,7 @@ def suite(tmp_path_factory) -> Path:
     return folder / "run"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("algorithm", SELECT)
 def test_sb3s_own_tests_of_sac(suite, algorithm):
     command = [sys.executable, "-m", "pytest", "-q", "-p", "sb3_suite_plugin", "-k", SELECT[algorithm], "tests"]
