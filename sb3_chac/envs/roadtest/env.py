@@ -52,8 +52,10 @@ class Crossing(NamedTuple):
 
 class RoadTestEnv(SafeDriveEnv):
     """
-    Rehearse the paper's road test: SafeDrive's roads, traffic, obstacles, actions, reward, cost and ends, on two fixed routes,
-    route 1 for training, route 2 for testing. What differs:
+    Rehearsal of the paper's road test on two fixed routes.
+
+    Route 1 is for training, route 2 for testing. Roads, traffic, obstacles, actions, reward, cost and ends are SafeDrive's. What
+    differs:
 
     **Observations**, shape (306,), in [-1, 1], those of the paper's vehicle:
 
