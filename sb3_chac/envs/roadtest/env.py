@@ -54,8 +54,8 @@ class RoadTestEnv(SafeDriveEnv):
     """
     Rehearsal of the paper's road test on two fixed routes.
 
-    Route 1 is for training, route 2 for testing. Roads, traffic, obstacles, actions, reward, cost and ends are SafeDrive's. What
-    differs:
+    Route 1 is for training, route 2 for testing. Roads, traffic, obstacles, actions, reward, cost and ends are SafeDrive's.
+    What differs:
 
     **Observations**, shape (306,), in [-1, 1], those of the paper's vehicle:
 
