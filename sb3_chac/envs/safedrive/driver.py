@@ -29,6 +29,7 @@ PATIENCE, BOXED_IN_FOR = 3.0, 8.0  # [s]
 DAWDLING = 0.4  # of the speed that the road allows
 IMPERFECTIONS = {
     "scripted": dict(reaction_delay=3, action_noise=0.1),
+    "scripted-careful": dict(reaction_delay=3, action_noise=0.1, desired_speed=8.0),
     "scripted-ideal": dict(reaction_delay=0, action_noise=0.0),
 }
 

@@ -358,7 +358,8 @@ class SafeDriveEnv(gym.Env, TakeoverDisplay):
 
     def scripted_driver(self, name: str = "scripted") -> ScriptedDriver:
         """
-        :param name: "scripted" (with a human's imperfections) or "scripted-ideal" (without)
+        :param name: "scripted" (with a human's imperfections), "scripted-careful" (the same at 8 instead of 10 m/s) or
+            "scripted-ideal" (without imperfections)
         :return: a driver for this environment
         :raises ValueError: for another name
         """
