@@ -1,6 +1,8 @@
 """What RL-Zoo3 has to be told of our algorithms, and gymnasium of our environments."""
 
 import importlib
+import os
+import sys
 from types import ModuleType
 
 import sb3_chac
@@ -21,6 +23,8 @@ def register() -> None:
 
 def add_environments(envs: ModuleType) -> None:
     """
+    Register our environments.
+
     :param envs: ``gymnasium.envs``, whose registry our package fills when it is imported
     """
     importlib.import_module("sb3_chac.envs")
@@ -28,6 +32,8 @@ def add_environments(envs: ModuleType) -> None:
 
 def add_algorithms(utils: ModuleType) -> None:
     """
+    Register our algorithms with RL-Zoo3.
+
     :param utils: ``rl_zoo3.utils``, whose ``ALGOS`` the rest of RL-Zoo3 shares by reference
     """
     from sb3_chac.zoo.errors import store_dict
@@ -39,6 +45,8 @@ def add_algorithms(utils: ModuleType) -> None:
 
 def add_experiments(exp_manager: ModuleType) -> None:
     """
+    Extend RL-Zoo3's experiments.
+
     :param exp_manager: ``rl_zoo3.exp_manager``
     """
     from sb3_chac.zoo.experiments import extend
@@ -51,10 +59,24 @@ def add_experiments(exp_manager: ModuleType) -> None:
 
 def add_training(train: ModuleType) -> None:
     """
+    Extend RL-Zoo3's training command.
+
     :param train: ``rl_zoo3.train``, whose command ends in one line for what is wrong with its arguments
     """
     from sb3_chac.zoo.errors import one_line
 
     command = train.train
+    if "--gym-packages" in sys.argv and os.getcwd() not in sys.path:
+        sys.path.append(os.getcwd())  # where a user's own environment may be
     if not hasattr(command, "__wrapped__"):
         train.train = one_line(ValueError, AssertionError, ImportError, OSError)(command)  # type: ignore[attr-defined]
+
+
+def add_metadata(push_to_hub: ModuleType) -> None:
+    """
+    Give ``rl_zoo3.push_to_hub`` the function that it imports: later versions call it otherwise, and return an object.
+
+    :param push_to_hub: ``huggingface_sb3.push_to_hub``
+    """
+    if not hasattr(push_to_hub, "generate_metadata"):
+        push_to_hub.generate_metadata = lambda *args: push_to_hub._generate_metadata(*args).to_dict()  # type: ignore[attr-defined]
