@@ -206,7 +206,7 @@ class DrivenTraining(Base):
 
     @property
     def stage_name(self) -> str:
-        return "you guide"
+        return "guided"
 
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
@@ -326,7 +326,7 @@ class DrivenStages(DrivenTraining):
         if self.stage == 2:  # type: ignore[attr-defined]
             watch = self.watch  # type: ignore[attr-defined]
             return "2: RELAPSE" if watch is not None and watch.relapsed else "2: self-learning"
-        return "1: you guide" if self.prefit_left is None else "1: prepares 2"
+        return "1: guided" if self.prefit_left is None else "1: prepares 2"
 
 
 class DrivenRounds(DrivenTraining):
@@ -349,7 +349,7 @@ class DrivenRounds(DrivenTraining):
     @property
     def stage_name(self) -> str:
         assert isinstance(self, HGDagger)
-        return f"round {self.round}" if self.round else "warm-up: you drive"
+        return f"round {self.round}" if self.round else "warm-up"
 
 
 @functools.cache

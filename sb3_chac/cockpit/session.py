@@ -40,7 +40,9 @@ class Display:
     :param picture: of the environment, shape (height, width, 3), uint8
     :param number: of the picture
     :param speed: [m/s], None if the environment does not tell
+    :param route: share of the route that is driven, None if the environment does not tell
     :param takeover: whether the person drove
+    :param brakes: whether the vehicle was braked because nobody is at the wheel
     :param proposed: by the novice: steering (-1 left to 1 right) and pedals (-1 brake to 1 throttle)
     :param applied: what was executed
     :param total_steps: of the training
@@ -48,12 +50,15 @@ class Display:
     :param seconds: [s] driven, without pauses
     :param episode: number of the episode in this drive
     :param cost: safety cost of this drive
+    :param collisions: of this drive
     """
 
     picture: np.ndarray | None = None
     number: int = 0
     speed: float | None = None
+    route: float | None = None
     takeover: bool = False
+    brakes: bool = False
     proposed: tuple[float, float] = (0.0, 0.0)
     applied: tuple[float, float] = (0.0, 0.0)
     total_steps: int = 0
@@ -61,6 +66,7 @@ class Display:
     seconds: float = 0.0
     episode: int = 0
     cost: float = 0.0
+    collisions: int = 0
     novice: Novice = Novice()
 
     @property
@@ -212,22 +218,40 @@ def lost_message(device: str) -> str:
     return f"No {device}: plug it in, or press K for the keyboard; then P goes on"
 
 
-def indicators(display: Display, lag: int) -> list[tuple[str, str]]:
+def who_drives(display: Display, is_manned: bool) -> str:
+    """
+    :param is_manned: whether somebody is at the wheel now
+    :return: "person", "brake" or "novice": never a person where nobody is
+    """
+    if display.brakes:
+        return "brake"
+    return ("person" if is_manned else "brake") if display.takeover else "novice"
+
+
+TAKEOVER = {"person": "YOU DRIVE", "brake": "nobody", "novice": "no"}
+FOR_OTHERS = "a person"  # what those see who only watch
+
+
+def indicators(display: Display, lag: int, is_manned: bool = True, watches: bool = False) -> list[tuple[str, str]]:
     """
     :param lag: gradient steps that the learner owes
+    :param is_manned: whether somebody is at the wheel now
+    :param watches: whether it is shown to somebody who is not at the wheel
     :return: names and values of what the paper's display shows, and how far the learner lags behind
     """
-    novice = display.novice
+    novice, driver = display.novice, who_drives(display, is_manned)
+    acts = "in use" if novice.self_drives and driver == "novice" else "no"
     minutes, seconds = divmod(int(display.seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return [
         ("speed", "-" if display.speed is None else f"{3.6 * display.speed:.0f} km/h"),
-        ("takeover", "YOU DRIVE" if display.takeover else "no"),
+        ("takeover", FOR_OTHERS if driver == "person" and watches else TAKEOVER[driver]),
+        ("route", "-" if display.route is None else f"{display.route:.0%}"),
         ("total step", f"{display.total_steps}"),
         ("total time", f"{hours}:{minutes:02}:{seconds:02}"),
         ("takeover rate", f"{display.takeover_rate:.1%}"),
         ("stage", novice.stage or "-"),
-        ("self-learning", "-" if novice.self_drives is None else "in use" if novice.self_drives else "no"),
+        ("self-learning", "-" if novice.self_drives is None else acts),
         ("confidence", "-" if novice.confidence is None else f"{novice.confidence:.2f}"),
         ("cost", f"{display.cost:g}"),
         ("episode", f"{display.episode}"),
