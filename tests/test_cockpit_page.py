@@ -18,7 +18,8 @@ from test_cockpit_browser import CHROMIUM, NOVICE, Served
 from sb3_chac.cockpit import server as server_module
 from sb3_chac.cockpit.browser import MOMENT, Address, BadMessage, Browser, Held, Wish, parse
 from sb3_chac.cockpit.env import STANDS
-from sb3_chac.cockpit.session import Display, Novice, indicators, who_drives
+from sb3_chac.cockpit.meter import CALM, LEAST, GuidanceMeter
+from sb3_chac.cockpit.session import Display, Novice, asks_for_help, indicators, who_drives
 
 needs_chromium = pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium")
 PHONES = [(390, 844), (844, 390), (360, 640), (640, 360)]
@@ -169,6 +170,41 @@ def test_collisions_are_counted_once(tmp_path):
     assert [env.step(NOVICE) and drive.display.collisions for _ in range(7)] == [0, 1, 1, 1, 1, 2, 2]
 
 
+# The guidance meter
+
+
+def test_risk_is_the_share_of_higher_values_and_help_is_asked_for_until_it_is_calm():
+    meter = GuidanceMeter(threshold=0.9)
+    assert [meter.tell(float(value)) for value in range(LEAST)] == [None] * LEAST and not meter.asks
+    assert meter.tell(None) is None
+    assert meter.tell(-1.0) == 1.0 and meter.asks
+    for step in range(CALM):
+        assert meter.asks
+        assert meter.tell(1000.0 + step) == 0.0
+    assert not meter.asks
+    assert meter.tell(LEAST / 2 - 0.5) == pytest.approx(0.5, abs=0.15)
+
+
+def test_without_a_threshold_nobody_is_asked():
+    meter = GuidanceMeter()
+    for value in range(2 * LEAST):
+        meter.tell(-float(value))
+    assert meter.tell(-1e9) == 1.0 and not meter.asks
+
+
+def test_memory_ends():
+    meter = GuidanceMeter(memory=LEAST)
+    for value in [1.0] * LEAST + [-1.0] * LEAST:
+        meter.tell(value)
+    assert meter.tell(-0.5) == 0.0
+
+
+def test_a_person_who_drives_is_not_asked():
+    display = Display(novice=Novice("1", risk=0.97, asks=True))
+    assert dict(indicators(display, 0))["risk"] == "HELP 97%" and asks_for_help(display, "novice")
+    assert dict(indicators(replace(display, takeover=True), 0))["risk"] == "97%"
+
+
 # The page
 
 CHECK = """() => {
@@ -249,7 +285,7 @@ def shows(page, element, text):
 @needs_chromium
 def test_nothing_overlaps_or_leaves_the_view_in_any_size(served):
     """With the longest values. Help and options fit as well, and are closed at first."""
-    novice = Novice("2: self-learning", True, 0.97)
+    novice = Novice("2: self-learning", True, 0.97, 1.0, True)
     numbers = {"total_steps": 1_234_567, "human_steps": 1_234_567, "seconds": 123_456.0, "cost": 1234.5, "collisions": 3}
     served.drive.lag = 123_456
     with chromium() as browser:

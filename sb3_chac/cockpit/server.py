@@ -30,7 +30,7 @@ except ImportError as error:
 
 from sb3_chac.cockpit.browser import Address, BadMessage, Browser, Held, Wish, is_number, parse
 from sb3_chac.cockpit.devices import Clock
-from sb3_chac.cockpit.session import Drive, indicators, who_drives
+from sb3_chac.cockpit.session import Drive, asks_for_help, indicators, who_drives
 
 logger = logging.getLogger(__name__)
 
@@ -359,6 +359,8 @@ class Server:
             "wants": now.takeover,
             "indicators": indicators(display, drive.lag, now.connected, role != "driver"),
             "confidence": display.novice.confidence,
+            "risk": display.novice.risk,
+            "asks": asks_for_help(display, driver),
             "proposed": display.proposed,
             "applied": display.applied,
             "input": (now.steering, now.pedals),

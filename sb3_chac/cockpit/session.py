@@ -25,11 +25,15 @@ class Novice:
     :param stage: of the training, to read
     :param self_drives: C-HAC in stage 2: whether the self-learning policy acts
     :param confidence: C-HAC in stage 2: P(Q_r > Q_g)
+    :param risk: rank of the proxy value of what it is about to do, see ``GuidanceMeter``
+    :param asks: whether it asks for help
     """
 
     stage: str = ""
     self_drives: bool | None = None
     confidence: float | None = None
+    risk: float | None = None
+    asks: bool = False
 
 
 @dataclass(frozen=True)
@@ -80,10 +84,12 @@ class Drive:
 
     :param person: at the wheel
     :param rate: [1/s] steps in real time, at most
+    :param query: risk from which the novice asks for help, see ``GuidanceMeter``; None never to ask
     """
 
-    def __init__(self, person: Person, rate: float = 10.0) -> None:
+    def __init__(self, person: Person, rate: float = 10.0, query: float | None = None) -> None:
         self.person = person
+        self.query = query
         self.period = 1 / rate
         self.display = Display()  # replaced as a whole
         self.novice = Novice()
@@ -228,6 +234,14 @@ def who_drives(display: Display, is_manned: bool) -> str:
     return ("person" if is_manned else "brake") if display.takeover else "novice"
 
 
+def asks_for_help(display: Display, driver: str) -> bool:
+    """
+    :param driver: see ``who_drives``
+    :return: whether the novice asks for help and has none yet
+    """
+    return display.novice.asks and driver == "novice"
+
+
 TAKEOVER = {"person": "YOU DRIVE", "brake": "nobody", "novice": "no"}
 FOR_OTHERS = "a person"  # what those see who only watch
 
@@ -240,6 +254,7 @@ def indicators(display: Display, lag: int, is_manned: bool = True, watches: bool
     :return: names and values of what the paper's display shows, and how far the learner lags behind
     """
     novice, driver = display.novice, who_drives(display, is_manned)
+    risk = "-" if novice.risk is None else f"{novice.risk:.0%}"
     acts = "in use" if novice.self_drives and driver == "novice" else "no"
     minutes, seconds = divmod(int(display.seconds), 60)
     hours, minutes = divmod(minutes, 60)
@@ -253,6 +268,7 @@ def indicators(display: Display, lag: int, is_manned: bool = True, watches: bool
         ("stage", novice.stage or "-"),
         ("self-learning", "-" if novice.self_drives is None else acts),
         ("confidence", "-" if novice.confidence is None else f"{novice.confidence:.2f}"),
+        ("risk", f"HELP {risk}" if asks_for_help(display, driver) else risk),
         ("cost", f"{display.cost:g}"),
         ("episode", f"{display.episode}"),
         ("updates behind", f"{lag}" if lag else "none"),

@@ -9,7 +9,7 @@ import numpy as np
 import pygame
 
 from sb3_chac.cockpit.devices import Command, Keyboard
-from sb3_chac.cockpit.session import Display, Drive, indicators, who_drives
+from sb3_chac.cockpit.session import Display, Drive, asks_for_help, indicators, who_drives
 from sb3_chac.envs.display import BLACK, EGO, HUMAN, ORANGE, PANEL, RED, TEXT
 
 PICTURE = pygame.Rect(0, 0, 800, 600)
@@ -149,25 +149,27 @@ class Window:
 
     def _draw_side(self, display: Display, lag: int) -> None:
         is_manned = self.drive.person.read().connected
-        colour_of_driver = COLOURS[who_drives(display, is_manned)]
+        driver = who_drives(display, is_manned)
+        colour_of_driver = COLOURS[driver]
         pygame.draw.rect(self.screen, colour_of_driver, (SIDE.left, 0, 6, SIDE.height))
         y = 24
         for name, value in indicators(display, lag, is_manned):
             colour = TEXT
             if name == "takeover" and colour_of_driver != EGO:
                 colour = colour_of_driver
-            elif name.startswith("updates") and lag:
+            elif (name.startswith("updates") and lag) or (name == "risk" and asks_for_help(display, driver)):
                 colour = ORANGE
             self._text(name, (SIDE.left + 24, y), self.font, DIM)
             self._text(value, (SIDE.right - 16, y), self.font, colour, "topright")
-            y += 36
-            if name == "confidence" and display.novice.confidence is not None:
-                bar = pygame.Rect(SIDE.left + 24, y - 6, SIDE.width - 40, 10)
+            y += 34
+            share = {"confidence": display.novice.confidence, "risk": display.novice.risk}.get(name)
+            if share is not None:
+                bar = pygame.Rect(SIDE.left + 24, y - 8, SIDE.width - 40, 10)
                 pygame.draw.rect(self.screen, BAR, bar, border_radius=3)
                 filled = bar.copy()
-                filled.width = round(bar.width * display.novice.confidence)
-                pygame.draw.rect(self.screen, EGO, filled, border_radius=3)
-                y += 18
+                filled.width = round(bar.width * share)
+                pygame.draw.rect(self.screen, EGO if name == "confidence" else ORANGE, filled, border_radius=3)
+                y += 14
         device = self.drive.person.device
         self._text(f"device: {device.name}", (SIDE.left + 24, SIDE.bottom - 56), self.small, DIM)
         self._text("H: help", (SIDE.left + 24, SIDE.bottom - 30), self.small, DIM)

@@ -31,6 +31,7 @@ let role = "";
 let pings = 0;
 let toldAt = 0;
 let collisions = null;
+let asks = false; // whether the novice asks for help
 const socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/ws${location.search}`);
 socket.binaryType = "blob";
 
@@ -63,11 +64,11 @@ async function setOption(name, isOn) {
   layout();
 }
 
-function beep() {
+function beep(frequency = 220) {
   audio ??= new AudioContext();
   audio.resume();
   const [tone, volume] = [audio.createOscillator(), audio.createGain()];
-  tone.frequency.value = 220;
+  tone.frequency.value = frequency;
   volume.gain.setValueAtTime(0.3, audio.currentTime);
   volume.gain.exponentialRampToValueAtTime(0.001, audio.currentTime + 0.4);
   tone.connect(volume).connect(audio.destination);
@@ -309,10 +310,10 @@ function makeCell(name) {
   const value = document.createElement("dd");
   value.id = `${name.replaceAll(" ", "-")}-value`;
   cell.append(term, value);
-  if (name === "confidence") {
+  if (name === "confidence" || name === "risk") {
     const meter = document.createElement("dd");
     meter.className = "meter";
-    meter.id = "confidence-bar";
+    meter.id = `${name}-bar`;
     meter.append(document.createElement("div"));
     cell.append(meter);
   }
@@ -321,6 +322,15 @@ function makeCell(name) {
 
 function setText(element, text) {
   if (element.textContent !== text) element.textContent = text;
+}
+
+function showQuery(isAsking) {
+  if (isAsking && !asks) {
+    if (options.vibration) navigator.vibrate?.([80, 60, 80]);
+    if (options.sound) beep(660);
+  }
+  asks = isAsking;
+  document.body.classList.toggle("asks", asks);
 }
 
 function showCollisions(number) {
@@ -336,7 +346,8 @@ function showCollisions(number) {
 function show(state) {
   role = state.role;
   document.body.dataset.driver = state.driver;
-  setText(byId("told"), state.driver === "person" && role === "driver" ? "You drive" : DRIVERS[state.driver]);
+  const told = state.driver === "person" && role === "driver" ? "You drive" : DRIVERS[state.driver];
+  setText(byId("told"), state.asks ? "The novice asks for help" : told);
   setText(byId("role"), ROLES[role]);
   byId("wheel").hidden = role !== "free";
   byId("notice").hidden = !state.notice;
@@ -345,8 +356,11 @@ function show(state) {
   const list = byId("indicators");
   if (list.childElementCount !== state.indicators.length) list.replaceChildren(...state.indicators.map(([name]) => makeCell(name)));
   for (const [name, value] of state.indicators) setText(byId(`${name.replaceAll(" ", "-")}-value`), value);
-  byId("confidence-bar").hidden = state.confidence === null;
-  byId("confidence-bar").firstElementChild.style.width = `${100 * (state.confidence ?? 0)}%`;
+  for (const name of ["confidence", "risk"]) {
+    byId(`${name}-bar`).hidden = state[name] === null;
+    byId(`${name}-bar`).firstElementChild.style.width = `${100 * (state[name] ?? 0)}%`;
+  }
+  showQuery(state.asks);
   for (const name of Object.keys(bars)) bars[name].forEach((set, i) => set(state[name][i]));
   for (const button of document.querySelectorAll("[data-wish]")) button.disabled = role !== "driver";
   for (const name in touched) byId(name).classList.toggle("off", role !== "driver");
