@@ -47,6 +47,7 @@ from sb3_chac.cockpit.window import Window
 RESULTS = Path(__file__).parent / "results" / "cockpit"
 PICTURES = Path(command.__file__).parent / "cockpit" / "images"
 KEYS = (pygame.K_LEFT, pygame.K_RIGHT, pygame.K_UP, pygame.K_DOWN, pygame.K_SPACE)
+OLD = {"chac": ("--env-kwargs", "corridors:False")}  # without which this agent was trained
 PERIOD = 0.1  # [s] of a step, as the environments say
 VERSIONS = " ".join(
     f"{name}={importlib.metadata.version(name)}" for name in ("sb3_chac", "torch", "numpy", "pygame-ce", "stable-baselines3")
@@ -295,7 +296,9 @@ def pictures() -> None:
         agent = Path(__file__).parent / "agents" / f"{algo}-SafeDrive-v0.zip"
         with tempfile.TemporaryDirectory() as folder:
             window = Window("picture")
-            run = make_run("SafeDrive-v0", folder, Keyboard(), "--algo", algo, "--trained-agent", str(agent))
+            run = make_run(
+                "SafeDrive-v0", folder, Keyboard(), "--algo", algo, "--trained-agent", str(agent), *OLD.get(algo, ())
+            )
 
             def is_over(run: DriveRun = run, window: Window = window, keys: list[int] = keys, name: str = name) -> bool:
                 display = run.drive.display
