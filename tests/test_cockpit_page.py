@@ -390,6 +390,7 @@ def test_the_keyboard_reaches_everything_and_space_stays_with_the_button(served)
 
 
 @needs_chromium
+@pytest.mark.slow
 def test_axe_finds_nothing_to_complain_of(served):
     axe = pytest.importorskip("axe_playwright_python.sync_playwright").Axe()
     served.drive.show(novice=Novice("2", True, 0.97), speed=3.0)
