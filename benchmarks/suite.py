@@ -3,7 +3,7 @@
     python benchmarks/suite.py run --suite table1 --seeds 3 --jobs 2      # stop it at any time, run it again, it goes on
     python benchmarks/suite.py run --suite table1 --scale 0.1             # all budgets a tenth
     python benchmarks/suite.py run --suite table1-metadrive --rows dpvp chac
-    python benchmarks/suite.py run --suite table1 --ray 127.0.0.1:6379    # on a Ray cluster (pip install "sb3-chac[ray]")
+    python benchmarks/suite.py run --suite table1 --ray 127.0.0.1:6379    # on a Ray cluster (pip install "ray>=2.50")
     python benchmarks/suite.py report --suite table1 --scale 0.1          # RESULTS.md and pictures from the CSVs
 
 Budgets and hyperparameters are those of hyperparams/<algo>.yml. Each job is `rl_zoo3 train` with checkpoints, then one
@@ -160,7 +160,7 @@ class OnRay:
         try:
             import ray
         except ImportError:
-            sys.exit('--ray: Ray is not installed. Run: pip install "sb3-chac[ray]"')
+            sys.exit('--ray: Ray is not installed. Run: pip install "ray>=2.50"')
         try:
             ray.init(address=address, log_to_driver=False)
         except (ConnectionError, ValueError, RuntimeError) as error:

@@ -26,7 +26,7 @@ try:
     import segno
     from aiohttp import WSCloseCode, WSMsgType, web
 except ImportError as error:
-    raise RuntimeError('--serve needs aiohttp and segno: pip install "sb3-chac[cockpit]".') from error
+    raise RuntimeError('--serve needs aiohttp and segno: pip install "aiohttp>=3.10" segno.') from error
 
 from sb3_chac.cockpit.browser import Address, BadMessage, Browser, Held, Wish, is_number, parse
 from sb3_chac.cockpit.devices import Clock

@@ -1,6 +1,8 @@
 """What RL-Zoo3 has to be told of our algorithms, and gymnasium of our environments."""
 
 import importlib
+import os
+import sys
 from types import ModuleType
 
 import sb3_chac
@@ -56,5 +58,7 @@ def add_training(train: ModuleType) -> None:
     from sb3_chac.zoo.errors import one_line
 
     command = train.train
+    if "--gym-packages" in sys.argv and os.getcwd() not in sys.path:
+        sys.path.append(os.getcwd())  # where a user's own environment may be
     if not hasattr(command, "__wrapped__"):
         train.train = one_line(ValueError, AssertionError, ImportError, OSError)(command)  # type: ignore[attr-defined]
