@@ -261,8 +261,8 @@ def report(args: argparse.Namespace) -> None:
 
 def report_switch(args: argparse.Namespace) -> list[dict[str, Any]]:
     """Table: what the switch to stage 2 costs in the steps after it, for C-HAC and its ablations (the paper's Figure 8)."""
-    end = SWITCH + AFTER_SWITCH
-    print(f"\n| to step {end // 1000}K | seeds | lowest return | drop | lowest success | training cost since the switch |")
+    titles = ("seeds", "lowest return", "drop", "lowest success", "training cost since the switch")
+    print(f"\n| in {AFTER_SWITCH // 1000}K steps after the switch | {' | '.join(titles)} |")
     print("|---|---|---|---|---|---|")
     rows = []
     for name, method in METHODS.items():
@@ -273,7 +273,9 @@ def report_switch(args: argparse.Namespace) -> list[dict[str, Any]]:
             before, after = args.results / f"{method.goes_on_from}-{seed}.csv", args.results / f"{name}-{seed}.csv"
             if not is_finished(after, method, args.steps):
                 continue
-            start, after_switch = read(before)[-1], [row for row in read(after) if int(row["step"]) <= end]
+            start = read(before)[-1]
+            end = int(start["step"]) + AFTER_SWITCH
+            after_switch = [row for row in read(after) if int(row["step"]) <= end]
             lowest = min(float(row["return_mean"]) for row in after_switch)
             drops.append(
                 {

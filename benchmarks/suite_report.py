@@ -134,6 +134,7 @@ def write(suite: str, scale: float, jobs: list[Job], results: "Results") -> None
         f"{suite_job.TEST_MAPS[-1]}, without the human; in brackets 95 % bootstrap intervals of the mean (rliable, seeds "
         "resampled map by map). In italics the paper's figures, which are MetaDrive's at the full budgets.",
         "",
+        *outdated(methods),
         *main_table(methods),
         "",
         *claims(methods),
@@ -151,6 +152,23 @@ def write(suite: str, scale: float, jobs: list[Job], results: "Results") -> None
     text += ["Versions: " + "; ".join(versions), ""]
     (results.folder / "RESULTS.md").write_text("\n".join(text))
     print(f"Saved {results.folder / 'RESULTS.md'}")
+
+
+def outdated(methods: dict[str, Method]) -> list[str]:
+    """
+    :return: a sentence that names the methods whose hyperparameters have changed since, if there are any
+    """
+    titles = [
+        method.title
+        for method in methods.values()
+        if any(
+            rows[0]["fingerprint"] != suite_job.fingerprint(job)
+            for job, rows in zip(method.jobs, method.episodes, strict=True)
+        )
+    ]
+    return (
+        [f"Made with the hyperparameters of that time, which have changed since: {', '.join(titles)}.", ""] if titles else []
+    )
 
 
 def main_table(methods: dict[str, Method]) -> list[str]:

@@ -1,6 +1,7 @@
 """The site builds without a warning, and the Python blocks of README and site run as they stand there."""
 
 import importlib
+import json
 import re
 import subprocess
 import sys
@@ -57,3 +58,16 @@ def test_links_to_files_lead_somewhere():
             if "://" not in target and not (page.parent / target).exists():
                 broken.append(f"{page_id(page)}: {target}")
     assert not broken
+
+
+@pytest.mark.slow
+def test_the_notebook_runs_top_to_bottom(monkeypatch):
+    import matplotlib
+
+    monkeypatch.setitem(matplotlib.rcParams, "backend", "Agg")
+    notebook = json.loads((ROOT / "examples" / "takeovers.ipynb").read_text(encoding="utf-8"))
+    namespace = {"__name__": "__main__"}
+    for cell in notebook["cells"]:
+        if cell["cell_type"] == "code":
+            exec(compile("".join(cell["source"]), "takeovers.ipynb", "exec"), namespace)
+    assert len(namespace["evaluation"].records) == 3

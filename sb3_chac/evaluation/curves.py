@@ -129,7 +129,8 @@ def draw_panel(
         marker = "o" if len(steps) == 1 else None
         (drawn[method.label],) = axes.plot(steps, means, color=colour, linestyle=line, linewidth=1.7, marker=marker)
         axes.fill_between(steps, low, high, color=colour, alpha=0.15, linewidth=0)
-        switches = [run[STAGE][run[STAGE][:, 1] == 2][0, 0] for run in runs if STAGE in run and 2 in run[STAGE][:, 1]]
+        stages = [run[STAGE] for run in runs if STAGE in run and {1, 2} <= set(run[STAGE][:, 1])]
+        switches = [stage[stage[:, 1] == 1][-1, 0] for stage in stages]
         if switches and steps[0] <= np.mean(switches) <= steps[-1]:
             switch = float(np.mean(switches))
             axes.plot(switch, np.interp(switch, steps, means), marker="D", markersize=5, color=colour, zorder=5)

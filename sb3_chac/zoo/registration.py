@@ -62,3 +62,13 @@ def add_training(train: ModuleType) -> None:
         sys.path.append(os.getcwd())  # where a user's own environment may be
     if not hasattr(command, "__wrapped__"):
         train.train = one_line(ValueError, AssertionError, ImportError, OSError)(command)  # type: ignore[attr-defined]
+
+
+def add_metadata(push_to_hub: ModuleType) -> None:
+    """
+    Give ``rl_zoo3.push_to_hub`` the function that it imports: later versions call it otherwise, and return an object.
+
+    :param push_to_hub: ``huggingface_sb3.push_to_hub``
+    """
+    if not hasattr(push_to_hub, "generate_metadata"):
+        push_to_hub.generate_metadata = lambda *args: push_to_hub._generate_metadata(*args).to_dict()  # type: ignore[attr-defined]
