@@ -324,9 +324,14 @@ function setText(element, text) {
   if (element.textContent !== text) element.textContent = text;
 }
 
+function vibrate(pattern) {
+  // Browsers refuse it until the page was touched
+  if (options.vibration && navigator.userActivation?.hasBeenActive) navigator.vibrate?.(pattern);
+}
+
 function showQuery(isAsking) {
   if (isAsking && !asks) {
-    if (options.vibration) navigator.vibrate?.([80, 60, 80]);
+    vibrate([80, 60, 80]);
     if (options.sound) beep(660);
   }
   asks = isAsking;
@@ -337,7 +342,7 @@ function showCollisions(number) {
   if (collisions !== null && number > collisions) {
     byId("view").classList.add("hit");
     setTimeout(() => byId("view").classList.remove("hit"), FLASH);
-    if (options.vibration) navigator.vibrate?.(200);
+    vibrate(200);
     if (options.sound) beep();
   }
   collisions = number;
