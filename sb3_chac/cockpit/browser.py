@@ -29,6 +29,8 @@ class Address(NamedTuple):
 
     def from_elsewhere(self) -> "Address":
         """
+        The address as other machines use it.
+
         :return: itself, but with this machine's address in its network in place of "all addresses"
         """
         if not (is_number(self.host) and ipaddress.ip_address(self.host).is_unspecified):
@@ -49,6 +51,8 @@ class Address(NamedTuple):
 
 def parse_address(text: str) -> Address:
     """
+    Parse the address to serve on.
+
     :param text: HOST:PORT or PORT (then on loopback)
     :raises ValueError: if it is neither
     """
@@ -61,6 +65,8 @@ def parse_address(text: str) -> Address:
 
 def is_number(host: str) -> bool:
     """
+    Tell IP addresses from names.
+
     :return: whether it is an IP address, not a name
     """
     with suppress(ValueError):
@@ -93,6 +99,8 @@ class Wish(NamedTuple):
 
 def parse(text: str) -> Held | Wish:
     """
+    Parse a message of the page.
+
     :param text: JSON, ``{"keys": [...], "gamepad": null or [x, y, z]}``, also with ``"touch": null or [x, y]``,
         ``{"wish": name}`` or ``{"ping": number}``
     :raises BadMessage: for everything else
@@ -162,6 +170,8 @@ class Browser:
 
     def handle(self, event: Any) -> Command | None:
         """
+        Take in an event of the person at the wheel.
+
         :param event: ``Held`` or ``Wish`` of who sits at the wheel
         """
         now = self.clock()

@@ -105,8 +105,10 @@ class Cockpit(gym.Wrapper):
 
     def _has_collided(self, info: dict[str, Any]) -> bool:
         """
+        Whether a collision has begun; environments report one by ``collision``, or by ``crashed`` for as long as it lasts.
+
         :param info: of a step
-        :return: whether a collision has begun in it; environments report one by ``collision``, or for as long as it lasts
+        :return: whether one has begun in it
         """
         before, self._touched = self._touched, bool(info.get("crashed", False))
         return bool(info.get("collision", self._touched and not before))

@@ -53,6 +53,8 @@ class Learner(threading.Thread):
 
     def owe(self, gradient_steps: int) -> None:
         """
+        Add gradient steps to those that are still to be made.
+
         :param gradient_steps: to be made
         :raises BaseException: what a gradient step has raised
         """
@@ -246,6 +248,8 @@ class DrivenTraining(Base):
     @th.no_grad()
     def _proxy_value(self, actions: np.ndarray) -> float | None:
         """
+        The proxy value that the guidance meter ranks.
+
         :param actions: scaled to [-1, 1], shape (1, 2)
         :return: the 10 % quantile of Z_g (PVP: the smaller Q_g) of the action in the present state; None before the first
             gradient step, and for algorithms without a proxy value
@@ -386,6 +390,8 @@ class DrivenRounds(DrivenTraining):
 @functools.cache
 def driven(algorithm: type[GuidedOffPolicyAlgorithm]) -> type[Any]:
     """
+    Derive the class of an algorithm that learns while a person drives.
+
     :param algorithm: that learns from takeovers
     :return: the same algorithm for a drive, see ``DrivenTraining``; what it saves is the algorithm's
     """

@@ -26,6 +26,8 @@ class GuidanceMeter:
 
     def tell(self, value: float | None) -> float | None:
         """
+        Take the next value.
+
         :param value: proxy value of the novice's action, None if there is none yet
         :return: risk, None as long as there are fewer than ``LEAST`` values to compare with
         """

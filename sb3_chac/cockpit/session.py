@@ -106,6 +106,8 @@ class Drive:
 
     def pause(self, message: str = "Paused: P goes on") -> None:
         """
+        Stop the clock.
+
         :param message: why
         """
         with self._changed:
@@ -139,6 +141,8 @@ class Drive:
 
     def obey(self, command: Command | None) -> None:
         """
+        Carry out a command of the person.
+
         :param command: of the person; those that concern the display alone are left to it
         """
         match command:
@@ -179,6 +183,8 @@ class Drive:
 
     def take_skip(self) -> bool:
         """
+        Tell once whether the episode is to end.
+
         :return: whether the episode is to end
         """
         with self._changed:
@@ -187,6 +193,8 @@ class Drive:
 
     def show(self, **changes: Any) -> None:
         """
+        Change what is displayed.
+
         :param changes: of ``display``
         """
         self.display = replace(self.display, **changes)
@@ -195,6 +203,8 @@ class Drive:
 
     def time_to_tick(self) -> float:
         """
+        Return the time that is left before the next step.
+
         :return: [s] until the next step, infinite in a pause
         """
         return float("inf") if self.paused else self._next_tick - time.monotonic()
@@ -214,6 +224,8 @@ class Drive:
 
 def lost_message(device: str) -> str:
     """
+    Word the message for a device that is gone.
+
     :param device: its name
     :return: what to tell a person whose device is gone
     """
@@ -226,6 +238,8 @@ def lost_message(device: str) -> str:
 
 def who_drives(display: Display, is_manned: bool) -> str:
     """
+    Tell who drives.
+
     :param is_manned: whether somebody is at the wheel now
     :return: "person", "brake" or "novice": never a person where nobody is
     """
@@ -236,6 +250,8 @@ def who_drives(display: Display, is_manned: bool) -> str:
 
 def asks_for_help(display: Display, driver: str) -> bool:
     """
+    Tell whether the person should hear that help is wanted.
+
     :param driver: see ``who_drives``
     :return: whether the novice asks for help and has none yet
     """
@@ -248,6 +264,8 @@ FOR_OTHERS = "a person"  # what those see who only watch
 
 def indicators(display: Display, lag: int, is_manned: bool = True, watches: bool = False) -> list[tuple[str, str]]:
     """
+    Collect the indicators of the paper's display.
+
     :param lag: gradient steps that the learner owes
     :param is_manned: whether somebody is at the wheel now
     :param watches: whether it is shown to somebody who is not at the wheel
