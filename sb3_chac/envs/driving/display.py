@@ -233,6 +233,8 @@ class Display:
 
     def _paint_numbers(self, info: dict[str, Any], human: bool) -> None:
         """
+        Paint the numbers in the corner.
+
         :param info: of the last step
         :param human: whether a person drives
         """
