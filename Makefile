@@ -6,11 +6,7 @@ DEMO := logs/demo
 DEMO_RUN := $(DEMO)/chac/SafeDrive-v0_1
 export OMP_NUM_THREADS ?= 1
 
-<<<<<<< HEAD
-.PHONY: demo test lint type format docs bench clean
-=======
-.PHONY: demo test test-slow lint type format bench clean
->>>>>>> a210f4ad291c0471a0747465c3a4480766d4fddf
+.PHONY: demo test test-slow lint type format docs bench clean
 
 # The main job: train C-HAC on SafeDrive with the scripted driver as the human, through RL-Zoo3's own command; evaluate what was
 # learned on maps that it has not seen, beside the human-guided policy alone and the human; draw the curves and film a drive.
