@@ -1,4 +1,5 @@
-"""Stable-Baselines3 algorithms for confidence-guided human-AI collaboration.
+"""
+Stable-Baselines3 algorithms for confidence-guided human-AI collaboration.
 
 The names below are imported on first use, so that ``import sb3_chac`` itself costs next to nothing.
 """

@@ -1,4 +1,5 @@
-"""``python -m sb3_chac train ...`` (or ``sb3-chac train ...``): RL-Zoo3's commands with our algorithms registered, and ours.
+"""
+``python -m sb3_chac train ...`` (or ``sb3-chac train ...``): RL-Zoo3's commands with our algorithms registered, and ours.
 
 RL-Zoo3's are for places where the stock ``rl_zoo3`` command does not find them (no .pth files, ``SB3_CHAC_NO_AUTOLOAD`` set).
 """
@@ -62,6 +63,7 @@ def import_packages(command: str, arguments: list[str]) -> list[str]:
 
 
 def main() -> None:
+    """Run the command that the command line names."""
     command = sys.argv[1] if len(sys.argv) > 1 else "nothing"
     if command in ("-h", "--help"):
         print(USAGE)

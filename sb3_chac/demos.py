@@ -19,8 +19,8 @@ from sb3_chac.common.demonstrations import DatasetError, load_demonstrations, op
 from sb3_chac.datasets.recording import WatchedEnv, record
 from sb3_chac.datasets.replay import Replay
 from sb3_chac.datasets.writer import SETTINGS
-from sb3_chac.evaluate import check_output, parse_env_kwargs
 from sb3_chac.evaluation import pictures
+from sb3_chac.evaluation.arguments import check_output, parse_env_kwargs
 from sb3_chac.evaluation.episodes import NotEvaluable, make_env
 from sb3_chac.evaluation.evaluation import saved_model
 from sb3_chac.evaluation.models import DEFAULT_ENV, find_algorithm, find_normalization, load_model
@@ -42,6 +42,7 @@ tells how far that led elsewhere than when it was recorded. The environment must
 
 
 def make_parser() -> argparse.ArgumentParser:
+    """Make the parser of the command line."""
     parser = argparse.ArgumentParser(
         "sb3-chac demos", description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -87,6 +88,8 @@ def make_parser() -> argparse.ArgumentParser:
 
 def main(arguments: list[str]) -> None:
     """
+    Run the command.
+
     :param arguments: of the command line, after ``demos``
     """
     parser = make_parser()
@@ -109,6 +112,8 @@ def _stop(signal_number: int, frame: FrameType | None) -> None:
 
 def run_record(args: argparse.Namespace) -> None:
     """
+    Record a dataset.
+
     :param args: see ``make_parser``
     :raises DatasetError: for a name that is taken, or spaces that a dataset cannot hold
     :raises FileNotFoundError: if a model does not exist
@@ -149,6 +154,8 @@ def run_record(args: argparse.Namespace) -> None:
 
 def find_model(path: Path, env_id: str, env_kwargs: dict[str, Any]) -> tuple[BaseAlgorithm, VecNormalize | None]:
     """
+    Load a model with the statistics of its observations.
+
     :return: the model, and the statistics that its observations are normalized with, if any
     """
     path, algo, algorithm = find_algorithm(path, None)
@@ -161,6 +168,8 @@ def find_model(path: Path, env_id: str, env_kwargs: dict[str, Any]) -> tuple[Bas
 
 def run_info(args: argparse.Namespace) -> None:
     """
+    Print what is in a dataset.
+
     :raises DatasetError: for a dataset that is missing, damaged or empty
     """
     print(describe(args.dataset))
@@ -168,6 +177,8 @@ def run_info(args: argparse.Namespace) -> None:
 
 def describe(dataset: str | os.PathLike[str]) -> str:
     """
+    Describe a dataset.
+
     :return: what there is to know about a dataset, to read
     :raises DatasetError: for one that is missing, damaged or empty
     """
@@ -205,6 +216,8 @@ def describe(dataset: str | os.PathLike[str]) -> str:
 
 def as_range(scenarios: list[int] | None) -> str:
     """
+    Word a list of scenarios.
+
     :return: "100:120" for 100 to 119 in their order, else the numbers themselves
     """
     if scenarios is None:
@@ -215,6 +228,8 @@ def as_range(scenarios: list[int] | None) -> str:
 
 def shortened(space: spaces.Space) -> str:
     """
+    Word a space in a few characters.
+
     :return: what to call it, without a number for each of its bounds
     """
     if not isinstance(space, spaces.Box):
@@ -224,6 +239,8 @@ def shortened(space: spaces.Space) -> str:
 
 def run_replay(args: argparse.Namespace) -> None:
     """
+    Drive an episode again.
+
     :raises DatasetError: for a dataset, or an episode of it, that is missing or cannot be driven again
     :raises NotEvaluable: if its environment cannot be made, or cannot render
     """

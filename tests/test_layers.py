@@ -21,11 +21,11 @@ LAYERS = (
     {"datasets"},
     {"deploy"},
     {"cockpit"},
-    {"cli", "evaluate", "drive", "resume", "plot", "compare", "demos"},
+    {"evaluate", "drive", "resume", "plot", "demos"},
+    {"compare"},  # reads runs as plot does
     {"__main__", "_startup"},
 )
 PARENTS = {"dpvp": {"dsac"}, "chac": {"dpvp"}, "hg_dagger": {"bc"}, "iwr": {"hg_dagger", "bc"}}  # an algorithm derives from it
-HELPERS = {("drive", "evaluate"), ("demos", "evaluate"), ("plot", "evaluate"), ("compare", "evaluate"), ("compare", "plot")}
 
 
 class Import(NamedTuple):
@@ -77,9 +77,9 @@ def is_upward(found: Import) -> bool:
     :return: whether an import breaks the order of the layers
     """
     level = {part: number for number, layer in enumerate(LAYERS) for part in layer}
-    if found.part == found.imported or (found.part, found.imported) in HELPERS:
+    if found.part == found.imported or found.imported in PARENTS.get(found.part, ()):
         return False
-    if found.imported in PARENTS.get(found.part, ()) or found.part == "__init__":  # the latter only names what it imports late
+    if found.part == "__init__":  # only names what it imports late
         return False
     return level[found.imported] >= level[found.part]
 

@@ -14,8 +14,9 @@ from hypothesis import strategies as st
 from shell import run
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
+from sb3_chac.envs.driving.geometry import boxes_overlap
 from sb3_chac.envs.safedrive import SafeDriveEnv
-from sb3_chac.envs.safedrive.geometry import Pose, Segment, boxes_overlap, chain, sample, turn
+from sb3_chac.envs.safedrive.geometry import Pose, Segment, chain, sample, turn
 from sb3_chac.envs.safedrive.lidar import Lidar
 from sb3_chac.envs.safedrive.map import BLOCKS, Map
 from sb3_chac.envs.safedrive.traffic import CAR_LENGTH, CAR_WIDTH

@@ -32,6 +32,8 @@ class Address(NamedTuple):
 
 def parse_address(text: str) -> Address:
     """
+    Parse the address to serve on.
+
     :param text: HOST:PORT or PORT (then on loopback)
     :raises ValueError: if it is neither
     """
@@ -44,6 +46,8 @@ def parse_address(text: str) -> Address:
 
 def is_number(host: str) -> bool:
     """
+    Tell IP addresses from names.
+
     :return: whether it is an IP address, not a name
     """
     with suppress(ValueError):
@@ -74,6 +78,8 @@ class Wish(NamedTuple):
 
 def parse(text: str) -> Held | Wish:
     """
+    Parse a message of the page.
+
     :param text: JSON, ``{"keys": [...], "gamepad": null or [x, y, z]}``, ``{"wish": name}`` or ``{"ping": number}``
     :raises BadMessage: for everything else
     """
@@ -136,6 +142,8 @@ class Browser:
 
     def handle(self, event: Any) -> Command | None:
         """
+        Take in an event of the person at the wheel.
+
         :param event: ``Held`` or ``Wish`` of who sits at the wheel
         """
         now = self.clock()

@@ -48,6 +48,8 @@ class Learner(threading.Thread):
 
     def owe(self, gradient_steps: int) -> None:
         """
+        Add gradient steps to those that are still to be made.
+
         :param gradient_steps: to be made
         :raises BaseException: what a gradient step has raised
         """
@@ -355,6 +357,8 @@ class DrivenRounds(DrivenTraining):
 @functools.cache
 def driven(algorithm: type[GuidedOffPolicyAlgorithm]) -> type[Any]:
     """
+    Derive the class of an algorithm that learns while a person drives.
+
     :param algorithm: that learns from takeovers
     :return: the same algorithm for a drive, see ``DrivenTraining``; what it saves is the algorithm's
     """

@@ -1,4 +1,5 @@
-"""The cockpit for a browser: the page, the pictures and what the driver does, over one WebSocket per viewer.
+"""
+The cockpit for a browser: the page, the pictures and what the driver does, over one WebSocket per viewer.
 
 Who may connect: only who has the access token of this drive, from a page that this server has sent. See ``Server``.
 """
@@ -203,6 +204,8 @@ class Server:
 
     def _remark(self, text: str) -> None:
         """
+        Log a remark, without any token.
+
         :param text: for the log, without a token
         """
         if not self._remarks.is_flooded():
@@ -214,12 +217,16 @@ class Server:
 
     def url(self, token: str) -> str:
         """
+        Build the address of the page.
+
         :param token: one of the two
         """
         return self.address.url(token, self.scheme)
 
     def _may_drive(self, request: web.Request) -> bool:
         """
+        Tell whether a request may drive or only watch.
+
         :raises HTTPForbidden: if it may not even watch
         """
         token = request.query.get("token", "").encode()
@@ -337,6 +344,8 @@ class Server:
 
     def state(self, viewer: Viewer) -> dict[str, Any]:
         """
+        Collect what the page shows besides the picture.
+
         :return: what the page shows besides the picture
         """
         drive, display, now = self.drive, self.drive.display, self.drive.person.read()
@@ -381,6 +390,8 @@ class _Refusal(asyncio.Protocol):
 
 def as_jpeg(picture: np.ndarray) -> bytes:
     """
+    Compress a picture.
+
     :param picture: shape (height, width, 3), uint8
     """
     file = io.BytesIO()
@@ -390,6 +401,8 @@ def as_jpeg(picture: np.ndarray) -> bytes:
 
 def tls_context(certificate: Path, key: Path | None) -> ssl.SSLContext:
     """
+    Load a certificate.
+
     :param certificate: PEM
     :param key: PEM, None if it is in the same file
     :raises ValueError: if they cannot be used

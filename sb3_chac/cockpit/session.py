@@ -94,6 +94,8 @@ class Drive:
 
     def pause(self, message: str = "Paused: P goes on") -> None:
         """
+        Stop the clock.
+
         :param message: why
         """
         with self._changed:
@@ -127,6 +129,8 @@ class Drive:
 
     def obey(self, command: Command | None) -> None:
         """
+        Carry out a command of the person.
+
         :param command: of the person; those that concern the display alone are left to it
         """
         match command:
@@ -167,6 +171,8 @@ class Drive:
 
     def take_skip(self) -> bool:
         """
+        Tell once whether the episode is to end.
+
         :return: whether the episode is to end
         """
         with self._changed:
@@ -175,6 +181,8 @@ class Drive:
 
     def show(self, **changes: Any) -> None:
         """
+        Change what is displayed.
+
         :param changes: of ``display``
         """
         self.display = replace(self.display, **changes)
@@ -183,6 +191,8 @@ class Drive:
 
     def time_to_tick(self) -> float:
         """
+        Return the time that is left before the next step.
+
         :return: [s] until the next step, infinite in a pause
         """
         return float("inf") if self.paused else self._next_tick - time.monotonic()
@@ -202,6 +212,8 @@ class Drive:
 
 def lost_message(device: str) -> str:
     """
+    Word the message for a device that is gone.
+
     :param device: its name
     :return: what to tell a person whose device is gone
     """
@@ -214,6 +226,8 @@ def lost_message(device: str) -> str:
 
 def indicators(display: Display, lag: int) -> list[tuple[str, str]]:
     """
+    Collect the indicators of the paper's display.
+
     :param lag: gradient steps that the learner owes
     :return: names and values of what the paper's display shows, and how far the learner lags behind
     """

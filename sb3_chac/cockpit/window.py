@@ -10,7 +10,7 @@ import pygame
 
 from sb3_chac.cockpit.devices import Command, Keyboard
 from sb3_chac.cockpit.session import Display, Drive, indicators
-from sb3_chac.envs.display import BLACK, EGO, HUMAN, ORANGE, PANEL, RED, TEXT
+from sb3_chac.envs.driving.display import BLACK, EGO, HUMAN, ORANGE, PANEL, RED, TEXT
 
 PICTURE = pygame.Rect(0, 0, 800, 600)
 SIDE = pygame.Rect(800, 0, 320, 600)
@@ -75,6 +75,8 @@ class Window:
 
     def run(self, drive: Drive, is_over: Callable[[], bool]) -> None:
         """
+        Show a drive until it is over.
+
         :param drive: is shown
         :param is_over: asked after each frame
         """
@@ -95,6 +97,8 @@ class Window:
 
     def handle(self, event: Any) -> None:
         """
+        Take in an event of pygame.
+
         :param event: of pygame
         """
         command = self.drive.person.handle(event)

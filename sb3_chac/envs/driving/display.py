@@ -52,6 +52,8 @@ class Display:
 
     def frame(self) -> np.ndarray:
         """
+        Paint the current state.
+
         :return: the picture, shape (height, width, 3), uint8
         """
         self._paint()
@@ -104,6 +106,8 @@ class Display:
 
     def _look(self, position: np.ndarray, heading: float) -> None:
         """
+        Set the view.
+
         :param position: [m] of the ego on the map, y downwards, shape (2,)
         :param heading: [rad] that is to be upwards, clockwise from the x axis
         """
@@ -119,6 +123,8 @@ class Display:
 
     def to_picture(self, points: np.ndarray) -> np.ndarray:
         """
+        Convert positions to pixels.
+
         :param points: [m] on the map, shape (..., 2)
         :return: [px] where they are in the picture painted last, x and y, shape (..., 2)
         """
@@ -132,6 +138,8 @@ class Display:
 
     def _paint_map(self, road_map: Any, areas: Callable[[], Iterable[Area]]) -> None:
         """
+        Paint the areas of the map.
+
         :param road_map: nothing but another one has other areas
         :param areas: painted one upon the other
         """
@@ -194,6 +202,8 @@ class Display:
 
     def _finish(self, info: dict[str, Any], flash: bool) -> None:
         """
+        Add signs of a collision and the panel.
+
         :param info: of the last step
         :param flash: whether a collision is to be seen
         """
