@@ -73,6 +73,9 @@ def make_parser() -> argparse.ArgumentParser:
     how.add_argument(
         "--steering", default="auto", choices=("auto", "left", "right"), help="side of the greatest first action (%(default)s)"
     )
+    how.add_argument(
+        "--query", type=float, metavar="RISK", help="the novice asks for help from this risk on, for example 0.95"
+    )
     how.add_argument("--go", action="store_true", help="begin at once, do not wait for P")
     where = parser.add_argument_group("what is written")
     where.add_argument("-f", "--log-folder", default="logs", help="(default: %(default)s)")
@@ -174,6 +177,18 @@ def without(option: str, arguments: list[str]) -> list[str]:
     return kept
 
 
+def check_numbers(args: argparse.Namespace) -> None:
+    """
+    Check numbers for which nothing is filled in.
+
+    :raises NotDrivable: for numbers out of their range
+    """
+    if args.rate is not None and not 0.5 <= args.rate <= 100:
+        raise NotDrivable(f"--rate must be from 0.5 to 100 steps per second, got {args.rate:g}.")
+    if args.query is not None and not 0 < args.query <= 1:
+        raise NotDrivable(f"--query must be above 0 and at most 1 (for example 0.95), got {args.query:g}.")
+
+
 def check_arguments(args: argparse.Namespace) -> None:
     """
     Also fills in what was left open.
@@ -200,8 +215,7 @@ def check_arguments(args: argparse.Namespace) -> None:
         raise NotDrivable(f"--trained-agent: there is no file {args.trained_agent}.")
     if args.pretrain and not args.demos:
         raise NotDrivable("--pretrain needs --demos: there is nothing to learn from before the drive.")
-    if args.rate is not None and not 0.5 <= args.rate <= 100:
-        raise NotDrivable(f"--rate must be from 0.5 to 100 steps per second, got {args.rate:g}.")
+    check_numbers(args)
     if args.serve and (args.device != "auto" or args.config):
         raise NotDrivable("--serve is driven with the browser's devices: leave out --device and --config.")
     if (args.tls_cert or args.tls_key) and not (args.serve and args.tls_cert):

@@ -1,6 +1,7 @@
 """Layers of the package, read from the source: what may import what, and that every import of ours exists."""
 
 import ast
+import configparser
 import importlib.util
 from collections.abc import Iterator
 from pathlib import Path
@@ -8,13 +9,15 @@ from typing import NamedTuple
 
 import pytest
 
+import sb3_chac
+
 ROOT = Path(__file__).parents[1]
 PACKAGE = "sb3_chac"
 # Lowest first. A part of the package imports from lower layers only, not even from others of its own layer, except:
 LAYERS = (
     {"common"},
     {"human", "envs"},
-    {"dsac", "pvp", "dpvp", "chac", "sac_lag", "ppo_lag", "bc", "cql", "gail", "hg_dagger", "iwr"},
+    set(sb3_chac.ALGORITHMS),
     {"__init__"},  # the public names, imported on first use, and the version
     {"zoo"},
     {"evaluation"},
@@ -121,3 +124,14 @@ def test_common_stands_alone():
 
 def test_the_package_is_found_where_these_sources_are():
     assert Path(importlib.util.find_spec(PACKAGE).origin).parents[1] == ROOT
+
+
+def test_every_package_is_installed():
+    setup = configparser.ConfigParser()
+    setup.read(ROOT / "setup.cfg")
+    packages = {".".join(file.parent.relative_to(ROOT).parts) for file in (ROOT / PACKAGE).rglob("__init__.py")}
+    assert set(setup["options"]["packages"].split()) == packages | {f"{PACKAGE}.hyperparams"}
+
+
+def test_every_algorithm_has_hyperparameters():
+    assert all((ROOT / "hyperparams" / f"{algorithm}.yml").is_file() for algorithm in sb3_chac.ALGORITHMS)

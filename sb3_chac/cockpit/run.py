@@ -97,7 +97,7 @@ class DriveRun:
     def __init__(self, args: argparse.Namespace, device: Device) -> None:
         register()
         self.args = args
-        self.drive = Drive(Person(device), args.rate or DEFAULT_RATE)
+        self.drive = Drive(Person(device), args.rate or DEFAULT_RATE, args.query)
         self.summary: Summary | None = None
         self.run_folder: Path | None = None
         self.error: BaseException | None = None

@@ -24,13 +24,14 @@ import numpy as np
 from PIL import Image
 
 try:
+    import segno
     from aiohttp import WSCloseCode, WSMsgType, web
 except ImportError as error:
-    raise RuntimeError('--serve needs aiohttp: pip install "aiohttp>=3.10".') from error
+    raise RuntimeError('--serve needs aiohttp and segno: pip install "aiohttp>=3.10" segno.') from error
 
 from sb3_chac.cockpit.browser import Address, BadMessage, Browser, Held, Wish, is_number, parse
 from sb3_chac.cockpit.devices import Clock
-from sb3_chac.cockpit.session import Drive, indicators
+from sb3_chac.cockpit.session import Drive, asks_for_help, indicators, who_drives
 
 logger = logging.getLogger(__name__)
 
@@ -221,7 +222,7 @@ class Server:
 
         :param token: one of the two
         """
-        return self.address.url(token, self.scheme)
+        return self.address.from_elsewhere().url(token, self.scheme)
 
     def _may_drive(self, request: web.Request) -> bool:
         """
@@ -349,6 +350,7 @@ class Server:
         :return: what the page shows besides the picture
         """
         drive, display, now = self.drive, self.drive.display, self.drive.person.read()
+        driver = who_drives(display, now.connected)
         if viewer is self.driver:
             role = "driver"
         elif not viewer.may_drive:
@@ -359,10 +361,15 @@ class Server:
             "role": role,
             "notice": drive.notice,
             "waits": bool(drive.paused or drive.busy or drive.ended),
-            "takeover": display.takeover,
+            "paused": drive.paused,
+            "driver": driver,
+            "takeover": driver == "person",
+            "collisions": display.collisions,
             "wants": now.takeover,
-            "indicators": indicators(display, drive.lag),
+            "indicators": indicators(display, drive.lag, now.connected, role != "driver"),
             "confidence": display.novice.confidence,
+            "risk": display.novice.risk,
+            "asks": asks_for_help(display, driver),
             "proposed": display.proposed,
             "applied": display.applied,
             "input": (now.steering, now.pedals),
@@ -397,6 +404,18 @@ def as_jpeg(picture: np.ndarray) -> bytes:
     file = io.BytesIO()
     Image.fromarray(np.ascontiguousarray(picture[..., :3])).save(file, "JPEG", quality=80)
     return file.getvalue()
+
+
+def qr_code(text: str) -> str:
+    """
+    Draw a QR code.
+
+    :param text: what a phone's camera is to read
+    :return: lines for a terminal
+    """
+    lines = io.StringIO()
+    segno.make(text, micro=False).terminal(lines, compact=True)
+    return lines.getvalue()
 
 
 def tls_context(certificate: Path, key: Path | None) -> ssl.SSLContext:
@@ -448,6 +467,8 @@ async def serve(
             )
         print(f"Drive at  {server.url(server.driver_token)}")
         print(f"Watch at  {server.url(server.spectator_token)}", flush=True)
+        if not server.address.is_loopback and sys.stdout.isatty():
+            print("Drive with a phone in this network:\n" + qr_code(server.url(server.driver_token)), flush=True)
         begin()
         while not is_over():
             await asyncio.sleep(0.1)

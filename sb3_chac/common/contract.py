@@ -157,9 +157,13 @@ class TakeoverWrapper(gym.Wrapper):
 
 
 class TakeoverDisplay:
-    """Base of environments whose pictures show what wrappers want to have shown (``hud``: name -> value)."""
+    """
+    Base of environments whose pictures show what wrappers want to have shown (``hud``: name -> value), in a box of numbers
+    unless ``panel`` is False: then whoever shows the picture shows them beside it.
+    """
 
     hud: dict[str, Any]
+    panel: bool = True
 
 
 class _ActionWrapperAboveTakeover(type):

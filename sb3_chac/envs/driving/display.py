@@ -214,12 +214,30 @@ class Display:
 
     def _paint_panel(self, info: dict[str, Any], flash: bool) -> None:
         """
-        The numbers in the corner, and above in the middle what is the matter.
+        The numbers in the corner, unless they are shown elsewhere, and above in the middle what is the matter.
 
         :param info: of the last step
         :param flash: whether a collision is to be seen
         """
         human = bool(self.env.hud.get("takeover"))
+        if getattr(self.env, "panel", True):
+            self._paint_numbers(info, human)
+        state = "collision" if flash else "arrived" if info["arrive_dest"] else "off the road" if info["out_of_road"] else ""
+        state = state or ("human drives" if human and getattr(self.env, "panel", True) else "")
+        if state:
+            colour = EGO if state == "arrived" else HUMAN if state == "human drives" else RED
+            text = self.large_font.render(state, True, BLACK if colour == HUMAN else WHITE)
+            place = text.get_rect(midtop=(SIZE[0] // 2, 20))
+            self.pygame.draw.rect(self.picture, colour, place.inflate(24, 12), border_radius=4)
+            self.picture.blit(text, place)
+
+    def _paint_numbers(self, info: dict[str, Any], human: bool) -> None:
+        """
+        Paint the numbers in the corner.
+
+        :param info: of the last step
+        :param human: whether a person drives
+        """
         rows = {
             "speed": f"{3.6 * info['speed']:.0f} km/h",
             "route": f"{info['route_completion']:.0%}",
@@ -238,14 +256,6 @@ class Display:
             box.blit(name, (18, 9 + i * line_height))
             box.blit(value, (width - 12 - value.get_width(), 9 + i * line_height))
         self.picture.blit(box, PANEL_POSITION)
-        state = "collision" if flash else "arrived" if info["arrive_dest"] else "off the road" if info["out_of_road"] else ""
-        state = state or ("human drives" if human else "")
-        if state:
-            colour = EGO if state == "arrived" else HUMAN if state == "human drives" else RED
-            text = self.large_font.render(state, True, BLACK if colour == HUMAN else WHITE)
-            place = text.get_rect(midtop=(SIZE[0] // 2, 20))
-            self.pygame.draw.rect(self.picture, colour, place.inflate(24, 12), border_radius=4)
-            self.picture.blit(text, place)
 
 
 def _text(value: Any) -> str:

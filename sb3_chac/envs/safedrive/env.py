@@ -339,7 +339,8 @@ class SafeDriveEnv(DrivingEnv):
         """
         Make a driver by its name.
 
-        :param name: "scripted" (with a human's imperfections) or "scripted-ideal" (without)
+        :param name: "scripted" (with a human's imperfections), "scripted-careful" (the same at 8 instead of 10 m/s) or
+            "scripted-ideal" (without imperfections)
         :return: a driver for this environment
         :raises ValueError: for another name
         """
