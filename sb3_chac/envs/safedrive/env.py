@@ -221,9 +221,7 @@ class SafeDriveEnv(DrivingEnv):
         check_driving_action(action)
         action = np.minimum(np.maximum(np.asarray(action, dtype=float), -1.0), 1.0)
         before = Pose(ego.position[0], ego.position[1], ego.heading)
-        ego.control(action[0], action[1])
-        for _ in range(SUBSTEPS):
-            ego.step(1 / (STEPS_PER_SECOND * SUBSTEPS))
+        action = self._move(action)
         previous_s = self.s
         self._locate()
         self.traffic.step(1 / STEPS_PER_SECOND, self.s, self.lateral, ego.speed, ego.position, ego.heading)
@@ -244,6 +242,17 @@ class SafeDriveEnv(DrivingEnv):
             self.render()
         terminated = self.arrived or self.out_of_road
         return self._observe(), float(reward), terminated, self.steps >= self.horizon, self._info()
+
+    def _move(self, action: np.ndarray) -> np.ndarray:
+        """
+        Move the ego for one step.
+
+        :return: the action that was executed
+        """
+        self.ego.control(action[0], action[1])
+        for _ in range(SUBSTEPS):
+            self.ego.step(1 / (STEPS_PER_SECOND * SUBSTEPS))
+        return action
 
     def _locate(self) -> None:
         """Where the ego is on the route, looked for close to where it was (the route may pass near itself)."""
