@@ -10,6 +10,7 @@ import yaml
 from guided_toys import Limited, column, make_batch, make_guided, parameters, same, scripted, silent, wrapper
 from scipy.stats import norm
 from stable_baselines3.common.logger import configure
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.utils import set_random_seed
 
 from sb3_chac import CHAC, DPVP, DSAC
@@ -598,10 +599,13 @@ def test_log(tmp_path, sign, self_share):
 def test_z_c_and_pi_r_learn_their_features(share_features_extractor):
     """Z_c is not the actor's, so that nothing else would teach its features extractor."""
 
-    class Features(th.nn.Linear):
+    class Features(BaseFeaturesExtractor):
         def __init__(self, observation_space, features_dim=4):
-            super().__init__(2, features_dim)
-            self.features_dim = features_dim
+            super().__init__(observation_space, features_dim)
+            self.linear = th.nn.Linear(2, features_dim)
+
+        def forward(self, observations):
+            return self.linear(observations)
 
     kwargs = dict(features_extractor_class=Features, share_features_extractor=share_features_extractor)
     model = make_chac(switch_after=30, policy_kwargs=kwargs)
