@@ -38,11 +38,13 @@ def main() -> None:
         return
 
     from sb3_chac.zoo import register
+    from sb3_chac.zoo.stopping import one_sentence
 
-    register()
-    from rl_zoo3.cli import main as zoo_main  # takes the commands as they are now
+    with one_sentence(f"sb3-chac {command}"):
+        register()
+        from rl_zoo3.cli import main as zoo_main  # takes the commands as they are now
 
-    zoo_main()
+        zoo_main()
 
 
 if __name__ == "__main__":

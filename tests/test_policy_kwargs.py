@@ -90,6 +90,18 @@ def test_a_target_entropy_may_count_actions(name):
         make_any(name, Walk(), target_entropy="auto-8")
 
 
+@pytest.mark.parametrize("name", [name for name in ALL if name not in (*IMITATING, *ON_POLICY, "CQL")])
+def test_an_agent_that_was_published_without_its_critics_does_not_learn(name):
+    model = make_any(name, Walk())
+    with th.no_grad():
+        for parameter in model.policy.critic.parameters():
+            parameter.zero_()
+    model.predict(np.zeros(2))
+    with pytest.raises(ValueError, match=r"^policy: the critics of this"):
+        model.learn(10)
+    assert model.num_timesteps == 0
+
+
 def test_cql_without_the_conservative_term():
     model = make_any("CQL", Walk(), conservative_weight=0.0).learn(5)
     assert all(value.isfinite().all() for value in model.policy.state_dict().values())

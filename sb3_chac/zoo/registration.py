@@ -1,10 +1,14 @@
 """What RL-Zoo3 has to be told of our algorithms, and gymnasium of our environments."""
 
+import contextlib
+import functools
 import importlib
+import sys
 from types import ModuleType
 
 import sb3_chac
 from sb3_chac.zoo.algorithms import ALGORITHMS
+from sb3_chac.zoo.stopping import check_threads, known_options, one_sentence
 
 
 def register() -> None:
@@ -51,10 +55,23 @@ def add_experiments(exp_manager: ModuleType) -> None:
 
 def add_training(train: ModuleType) -> None:
     """
-    :param train: ``rl_zoo3.train``, whose command ends in one line for what is wrong with its arguments
+    :param train: ``rl_zoo3.train``, whose command ends in one line for what is wrong with its arguments, and with one sentence
+        when it is stopped before our algorithms, or others in our environments, learn
     """
+    from sb3_chac.envs import ENVIRONMENTS
     from sb3_chac.zoo.errors import one_line
 
     command = train.train
-    if not hasattr(command, "__wrapped__"):
-        train.train = one_line(ValueError, AssertionError, ImportError, OSError)(command)  # type: ignore[attr-defined]
+    if hasattr(command, "__wrapped__"):
+        return
+
+    @functools.wraps(command)
+    def checked_command() -> None:
+        options = known_options(sys.argv[1:])
+        is_ours = options.algo in ALGORITHMS or options.env in ENVIRONMENTS
+        with one_sentence("rl_zoo3 train") if is_ours else contextlib.nullcontext():
+            with one_line(ValueError, AssertionError, ImportError, OSError):
+                check_threads(options.num_threads)
+                command()
+
+    train.train = checked_command  # type: ignore[attr-defined]
