@@ -7,8 +7,8 @@ Counts go to benchmarks/results/refusals: a CSV for each part, with a row for ea
 
 - commands: command lines of our own commands. Clear is: exit code 2, one line, which names the option or the value.
 - zoo: command lines and yaml files of `rl_zoo3 train` with our algorithms, by the same measure.
-- arguments: NaN, inf, text, a list, -1, 0, True and an integer of 400 digits for each argument of each constructor that cannot be
-  that. Clear is: a ValueError that names the argument, before anything is built.
+- arguments: NaN, inf, text, a list, -1, 0, True, an integer of 400 digits and others, for each argument of each constructor
+  that cannot be that. Clear is: a ValueError that names the argument, before anything is built.
 - kills: see benchmarks/chaos.py; one row a kill, and the full disk.
 - data: files that name code (tests/test_untrusted_data.py), one row a file. Clear is: nothing of it ran.
 """

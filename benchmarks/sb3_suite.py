@@ -3,8 +3,8 @@
     python benchmarks/sb3_suite.py                       # all, three minutes of one core
     python benchmarks/sb3_suite.py --only PVP GAIL
 
-The tests are those in the source distribution of the installed version. Results go to benchmarks/results/sb3-suite: a row a test
-in tests.csv, and table.md. What cannot apply is listed there with its reason, from tests/sb3_suite_roles.py.
+The tests are those in the source distribution of the installed version. Results go to benchmarks/results/sb3-suite: a row a
+test in tests.csv, and table.md. What cannot apply is listed there with its reason, from tests/sb3_suite_roles.py.
 """
 
 import argparse

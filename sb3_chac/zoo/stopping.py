@@ -1,4 +1,4 @@
-"""SIGTERM and Ctrl-C while nothing is learned, and options of RL-Zoo3 that nobody checks. Imports the standard library only."""
+"""SIGTERM and Ctrl-C while nothing is learned, and options of RL-Zoo3 that nobody checks: with the standard library alone."""
 
 import argparse
 import os
