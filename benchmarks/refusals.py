@@ -16,6 +16,7 @@ Counts go to benchmarks/results/refusals: a CSV for each part, with a row for ea
 import argparse
 import contextlib
 import csv
+import importlib
 import io
 import os
 import re
@@ -174,10 +175,9 @@ def own_lines() -> Iterator[tuple[list[str], tuple[str, ...]]]:
                     position = given.index(option)
                     del given[position : position + 2]
                 added = [*option.split(), value] if option.startswith("-") else option.split()
-                yield (
-                    [*given, *added],
-                    tuple(filter(None, (option.lstrip("-"), value[:40], *option.split(), base.split()[-1]))),
-                )
+                start = value.partition(":")[0][:40]
+                named = (option.lstrip("-"), value[:40], start, *option.split(), base.split()[-1])
+                yield [*given, *added], tuple(filter(None, named))
 
 
 def zoo_lines() -> Iterator[tuple[list[str], tuple[str, ...], str]]:
@@ -203,6 +203,9 @@ def zoo_lines() -> Iterator[tuple[list[str], tuple[str, ...], str]]:
             yield ["train", "--algo", algo, "--env", ENV, *quick, "--conf-file", "bad.yml"], (named,), content
 
 
+NOISE = "^usage:|^ |[Ww]arning|episode/s|s/episode"  # what else a command may say
+
+
 def attempt(arguments: list[str], named: tuple[str, ...], main: Callable[[], None], content: str = "") -> Attempt:
     """
     Runs a command in a copy of this process, in an empty folder but for ``file`` and bad.yml.
@@ -211,28 +214,25 @@ def attempt(arguments: list[str], named: tuple[str, ...], main: Callable[[], Non
     """
     tried = " ".join(argument if len(argument) < 80 else f"{argument[:20]}...({len(argument)})" for argument in arguments)
     tried += f"  # {content!r}" if content else ""
-    with tempfile.TemporaryDirectory() as folder, tempfile.TemporaryFile("w+") as output:
+    with tempfile.TemporaryDirectory() as folder, tempfile.TemporaryFile("w+") as errors:
         Path(folder, "file").write_text("in the way")
         Path(folder, "bad.yml").write_text(content)
         sys.stdout.flush(), sys.stderr.flush()
         child = os.fork()
         if child == 0:
             os.chdir(folder)
-            for stream in (1, 2):
-                os.dup2(output.fileno(), stream)
+            os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+            os.dup2(errors.fileno(), 2)
             resource.setrlimit(resource.RLIMIT_CPU, (CPU_LIMIT, CPU_LIMIT))
             sys.argv = ["sb3-chac", *arguments]
             code = run_to_the_end(main)
             sys.stdout.flush(), sys.stderr.flush()
             os._exit(code)
         code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
-        output.seek(0)
-        printed = output.read()
+        errors.seek(0)
+        printed = errors.read()
     # argparse tells how it is used first, and there may be a progress bar
-    noise = (
-        "^usage:|^ |[Ww]arning|episode/s|s/episode|^=+|^Seed|^Log path|^Default hyper|^OrderedDict|^Using|^Loading|^\\(|^\\["
-    )
-    lines = [line for line in printed.splitlines() if line.strip() and not re.search(noise, line)]
+    lines = [line for line in printed.splitlines() if line.strip() and not re.search(NOISE, line)]
     clear = code == 2 and len(lines) == 1 and "Traceback" not in printed and any(word in lines[0] for word in named)
     return Attempt(tried, clear, f"[{code}] " + " / ".join(lines)[-200:])
 
@@ -256,20 +256,31 @@ def run_to_the_end(main: Callable[[], None]) -> int:
     return 0
 
 
-def commands() -> Iterator[Attempt]:
-    from sb3_chac.__main__ import main
+def warm_up() -> Callable[[], None]:
+    """
+    :return: our command, with all that it imports at hand for copies of this process
+    """
+    import gymnasium as gym
+
+    from sb3_chac.__main__ import OWN_COMMANDS, main
     from sb3_chac.zoo import register
 
     register()
+    for module in OWN_COMMANDS.values():
+        importlib.import_module(module)
+    gym.make("SafeDrive-v0").reset(seed=0)
+    gym.make(ENV)
+    return main
+
+
+def commands() -> Iterator[Attempt]:
+    main = warm_up()
     for arguments, named in own_lines():
         yield attempt(arguments, named, main)
 
 
 def zoo() -> Iterator[Attempt]:
-    from sb3_chac.__main__ import main
-    from sb3_chac.zoo import register
-
-    register()
+    main = warm_up()
     for arguments, named, content in zoo_lines():
         yield attempt(arguments, named, main, content)
 
@@ -343,14 +354,14 @@ def main(given: list[str]) -> None:
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     warnings.simplefilter("ignore")
     for part in args.only:
-        attempts = list(PARTS[part]())
         with (RESULTS / f"{part}.csv").open("w", newline="") as file:
             writer = csv.writer(file, lineterminator="\n")
             writer.writerow(Attempt._fields)
-            writer.writerows(attempts)
-        for one in attempts:
-            if not one.clear:
-                print(f"{part}: {one.tried}\n    {one.said}", flush=True)
+            for one in PARTS[part]():
+                writer.writerow(one)
+                file.flush()
+                if not one.clear:
+                    print(f"{part}: {one.tried}\n    {one.said}", flush=True)
     (RESULTS / "table.md").write_text(table())
     print(table())
 
