@@ -6,7 +6,7 @@ DEMO := logs/demo
 DEMO_RUN := $(DEMO)/chac/SafeDrive-v0_1
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: demo test lint type format bench clean
+.PHONY: demo test test-slow lint type format bench clean
 
 # The main job: train C-HAC on SafeDrive with the scripted driver as the human, through RL-Zoo3's own command; evaluate what was
 # learned on maps that it has not seen, beside the human-guided policy alone and the human; draw the curves and film a drive.
@@ -21,7 +21,11 @@ demo: $(INSTALLED)
 	@echo "Everything is in $(DEMO): curves.png, drive.mp4, paths.png, evaluation.json; the model is in $(DEMO_RUN)"
 
 test: lint type
-	$(BIN)/python -m pytest -n 2 --dist loadfile
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m "not slow"
+
+# What `make test` leaves out: installing everything anew, SB3's whole test suite, long soaks
+test-slow: $(INSTALLED)
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m slow
 
 lint: $(INSTALLED)
 	$(BIN)/ruff check .

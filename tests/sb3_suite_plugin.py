@@ -53,13 +53,21 @@ def in_role(name: str) -> type:
 
     class Quick(base):
         def __init__(self, *args: Any, **kwargs: Any):
-            pace = {"learning_rate": 3e-4, "policy_delay": 1, "warm_up_steps": 0, "n_epochs": 2, "actor_lr": 3e-4}
+            pace: dict[str, Any] = {
+                "learning_rate": 3e-4,
+                "policy_delay": 1,
+                "warm_up_steps": 0,
+                "n_epochs": 2,
+                "actor_lr": 3e-4,
+            }
             if "learning_rate" in kwargs:
                 pace |= dict.fromkeys(("ent_coef_lr", "actor_lr"), kwargs["learning_rate"])
             else:
                 pace["ent_coef_lr"] = 3e-4
             if roles.ROLES[name] == "PPO":
                 pace = {}
+            elif roles.ROLES[name] == "SAC":
+                pace["ent_coef"] = "auto"  # as SAC's, but not D-PVP's
             super().__init__(*args, **{key: value for key, value in (pace | kwargs).items() if key in known})
             if name in ("HGDagger", "IWR") and kwargs.get("_init_setup_model", True):
                 self.store_demonstrations(random_demonstrations(self.observation_space, self.action_space))

@@ -2,6 +2,7 @@
 
 import os
 import subprocess
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -25,6 +26,14 @@ def clean_environment() -> dict[str, str]:
     :return: the environment variables, without those that lead to another installation
     """
     return {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "VIRTUAL_ENV")}
+
+
+def zoo_train(monkeypatch, *arguments: str | Path) -> None:
+    """``rl_zoo3 train`` in this process, for tests that ask nothing of the process itself: its imports cost seconds."""
+    from rl_zoo3.train import train
+
+    monkeypatch.setattr(sys, "argv", ["rl_zoo3", *map(str, arguments)])
+    train()
 
 
 def run(*command: str | Path, cwd: Path, env: dict[str, str] | None = None, fails: bool = False) -> str:

@@ -77,6 +77,7 @@ ZOO = [
     ("-params replay_buffer_class:'nonsense'", "replay_buffer_class"),
     ("-params replay_buffer_kwargs:1", "replay_buffer_kwargs"),
     ("-params monitor_kwargs:1", "monitor_kwargs"),
+    ("-params policy_delay:0", "policy_delay"),
     ("-params delta:3 --algo chac", "delta"),
     ("-params bootstrap:'nonsense' --algo chac", "bootstrap"),
     ("-params dataset:'nowhere-v0' --algo bc", "nowhere-v0"),

@@ -242,6 +242,7 @@ def test_the_memory_of_stage_2_is_flat_without_a_logger(monkeypatch):
     assert model.stage == 2 and len(model.choices) == 20
 
 
+@pytest.mark.slow
 def test_chaos(tmp_path):
     """Kills in both stages, a damaged checkpoint, a full disk: the small size of benchmarks/chaos.py."""
     command = [sys.executable, str(BENCHMARKS / "chaos.py"), "--kills", "3", "--steps", "160", "--seed", "1"]
@@ -249,7 +250,7 @@ def test_chaos(tmp_path):
     assert ran.returncode == 0, ran.stdout + ran.stderr
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize("number", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.slow)])
 def test_the_command_answers_a_signal_with_one_sentence(tmp_path, number):
     command = [
         sys.executable,

@@ -78,12 +78,19 @@ def assert_finite(model):
     assert all(np.isfinite(value) for value in getattr(model, "counts", {}).values())
 
 
+def in_turn(cases, values):
+    """Each case with one of the values, by turns; the others are slow."""
+    for i, case in enumerate(cases):
+        for j, value in enumerate(values):
+            marks = () if i % len(values) == j else pytest.mark.slow
+            yield pytest.param(*case, VALUES[value], marks=marks, id="-".join((*case, value)))
+
+
 CASES = [(name, source) for name in ALL if name not in OFFLINE for source in SOURCES]
 CASES += [(name, source) for name in GUIDED for source in OF_TAKEOVERS]
 
 
-@pytest.mark.parametrize("value", VALUES.values(), ids=VALUES)
-@pytest.mark.parametrize("name, source", CASES)
+@pytest.mark.parametrize("name, source, value", in_turn(CASES, VALUES))
 def test_steps_that_are_not_finite_are_refused(name, source, value):
     kwargs = {"dataset": float64_demonstrations()} if name == "GAIL" else {}
     model = make_any(name, Broken(source, value), **kwargs)
@@ -98,9 +105,12 @@ def float64_demonstrations(**columns):
     return demonstrations(**(as_double | {"observation_space": Broken.observation_space} | columns))
 
 
-@pytest.mark.parametrize("value", [np.nan, np.inf], ids=["nan", "inf"])
-@pytest.mark.parametrize("source", ["observation", "very first observation", "reward"])
-@pytest.mark.parametrize("name", [name for name in ALL if name not in OFFLINE])
+NORMALIZED = [
+    (name, source) for name in ALL if name not in OFFLINE for source in ("observation", "very first observation", "reward")
+]
+
+
+@pytest.mark.parametrize("name, source, value", in_turn(NORMALIZED, ("nan", "inf")))
 def test_normalizing_hides_nothing(name, source, value):
     """Statistics that are not in training clip what is infinite."""
     env = VecNormalize(DummyVecEnv([lambda: Broken(source, value)]), training=False)
@@ -111,9 +121,10 @@ def test_normalizing_hides_nothing(name, source, value):
     assert_finite(model)
 
 
-@pytest.mark.parametrize("value", VALUES.values(), ids=VALUES)
-@pytest.mark.parametrize("column", IN_DATASETS)
-@pytest.mark.parametrize("name", [*OFFLINE, "GAIL", *GUIDED])
+LEARN_FROM_DATASETS = [(name, column) for name in (*OFFLINE, "GAIL", *GUIDED) for column in IN_DATASETS]
+
+
+@pytest.mark.parametrize("name, column, value", in_turn(LEARN_FROM_DATASETS, VALUES))
 def test_datasets_that_are_not_finite_are_refused(name, column, value):
     good = float64_demonstrations()
     values = np.zeros((36, 2)[: 1 + (column not in ("costs", "rewards"))])

@@ -9,7 +9,7 @@ from sb3_chac.envs.metadrive import MetaDriveSafetyEnv
 from sb3_chac.envs.metadrive.driver import ScriptedDriver
 
 
-@pytest.fixture(scope="module", params=["chac", "pvp"])
+@pytest.fixture(scope="module", params=["chac", pytest.param("pvp", marks=pytest.mark.slow)])
 def env(request):
     env = MetaDriveSafetyEnv(preset=request.param, headless=True)
     yield env

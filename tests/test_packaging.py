@@ -3,6 +3,7 @@
 import shutil
 import subprocess
 import sys
+import sysconfig
 import tarfile
 import zipfile
 from pathlib import Path
@@ -11,7 +12,7 @@ import pytest
 from shell import run
 
 ROOT = Path(__file__).parent.parent
-TRAIN = ["train", "--env", "Pendulum-v1", "-n", "250", "--eval-freq", "-1", "-f", "logs"]
+TRAIN = ["train", "--env", "Pendulum-v1", "-n", "120", "--eval-freq", "-1", "-f", "logs"]
 SMALL = ["-params", "learning_starts:100", "policy_kwargs:dict(net_arch=[8])"]
 
 
@@ -49,8 +50,13 @@ def test_wheel_and_sdist_carry_what_is_needed(dist):
     assert {"build_hooks.py", "sb3_chac.pth", "sb3_chac.start", "hyperparams/dsac.yml", "LICENSE", "CHANGELOG.md"} <= files
 
 
-def test_stock_rl_zoo3_in_a_fresh_environment(dist, source, tmp_path):
-    """One environment after another costs minutes, so this one is used in turn for each way to install."""
+@pytest.mark.parametrize("dependencies", ["of this environment", pytest.param("new", marks=pytest.mark.slow)])
+def test_stock_rl_zoo3_in_a_fresh_environment(dist, source, tmp_path, dependencies):
+    """
+    One environment after another costs minutes, so this one is used in turn for each way to install.
+
+    :param dependencies: installed anew, as for a user, or found where the tests run
+    """
     venv, work = tmp_path / "venv", tmp_path / "work"
     work.mkdir()
     run(sys.executable, "-m", "venv", venv, cwd=tmp_path)
@@ -58,8 +64,16 @@ def test_stock_rl_zoo3_in_a_fresh_environment(dist, source, tmp_path):
     install = [python, "-m", "pip", "install", "--quiet", "--constraint", ROOT / "constraints.txt"]
     site_packages = Path(run(python, "-c", "import sysconfig; print(sysconfig.get_path('purelib'))", cwd=work).strip())
 
+    if dependencies == "new":
+        run(*install, "torch", cwd=work)
+    else:
+        # Packages in there are found, but no .pth file in there is read: an editable installation of ours is not seen
+        (site_packages / "dependencies.pth").write_text(sysconfig.get_path("purelib"))
+        install += ["--no-deps", "--ignore-installed"]
+        rl_zoo3.write_text(f"#!{python}\nfrom rl_zoo3.cli import main\nmain()\n")
+        rl_zoo3.chmod(0o755)
+
     # The wheel
-    run(*install, "torch", cwd=work)
     run(*install, next(dist.glob("*.whl")), cwd=work)
     output = run(rl_zoo3, *TRAIN, "--algo", "dsac", *SMALL, cwd=work)
     assert str(site_packages / "sb3_chac" / "hyperparams" / "dsac.yml") in output

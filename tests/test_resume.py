@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from shell import clean_environment, run, wait_until
+from shell import clean_environment, run, zoo_train
 from stable_baselines3.common.callbacks import ConvertCallback
 from stable_baselines3.common.save_util import load_from_pkl
 
@@ -31,9 +31,9 @@ from sb3_chac.zoo.runs import find_training, steps
 
 SCRIPTS = Path(sysconfig.get_path("scripts"))
 RUNS = Path("logs") / "chac"
-SWITCH_AFTER, TOTAL = 250, 600
+SWITCH_AFTER, TOTAL = 150, 300
 TRAIN = [
-    *("--algo", "chac", "--env", "SafeDrive-v0", "-n", str(TOTAL), "--save-freq", "100", "--eval-freq", "300"),
+    *("--algo", "chac", "--env", "SafeDrive-v0", "-n", str(TOTAL), "--save-freq", "60", "--eval-freq", "150"),
     *("--eval-episodes", "1", "-f", "logs", "--seed", "1", "--env-kwargs", "horizon:60", "blocks:2"),
     *(
         "-params",
@@ -56,7 +56,7 @@ save = BaseAlgorithm.save
 
 def die(self, path, *args, **kwargs):
     save(self, path, *args, **kwargs)
-    if getattr(path, "name", "").endswith("200.tmp/SafeDrive-v0.zip"):
+    if getattr(path, "name", "").endswith("120.tmp/SafeDrive-v0.zip"):
         path.truncate(1000)
         os.kill(os.getpid(), signal.SIGKILL)
 
@@ -65,29 +65,34 @@ train()
 """
 
 
-def kill_after_checkpoint(step: int, run_folder: Path, *command: str | Path, cwd: Path) -> None:
-    """Starts the command, and kills it with SIGKILL once there is a checkpoint of at least this step."""
-    with (cwd / "output").open("w") as output:
-        process = subprocess.Popen(
-            list(map(str, command)), cwd=cwd, env=clean_environment(), stdout=output, stderr=subprocess.STDOUT
-        )
+# sb3-chac, and kill -9 in stage 2, 20 steps after a checkpoint
+DIE_IN_STAGE_2 = """
+import os, signal
+from sb3_chac.__main__ import main
+from sb3_chac.common.checkpoints import ResumableCheckpoint
 
-        def is_there() -> bool:
-            newest = newest_checkpoint(cwd / run_folder / "checkpoints")
-            return newest is not None and int(newest.name) >= step
+def die(self):
+    if self.model.num_timesteps == 260:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return True
 
-        wait_until(lambda: is_there() or process.poll() is not None)
-        process.kill()
-        assert process.wait() == -signal.SIGKILL, (cwd / "output").read_text()
+ResumableCheckpoint._on_step = die
+main()
+"""
+
+
+def run_killed(*command: str | Path, cwd: Path) -> None:
+    """Runs a command that kills itself."""
+    ended = subprocess.run(list(map(str, command)), cwd=cwd, env=clean_environment(), capture_output=True, text=True)
+    assert ended.returncode == -signal.SIGKILL, ended.stdout + ended.stderr
 
 
 @pytest.fixture(scope="module")
 def killed(tmp_path_factory) -> Path:
     """A folder with three runs: killed in stage 1 while it wrote a checkpoint, resumed and killed in stage 2, resumed."""
     folder = tmp_path_factory.mktemp("resume")
-    run(sys.executable, "-c", DIE_WHILE_WRITING, *TRAIN, cwd=folder, fails=True)
-    launcher = [sys.executable, "-m", "sb3_chac", "resume"]
-    kill_after_checkpoint(400, RUNS / "SafeDrive-v0_2", *launcher, RUNS / "SafeDrive-v0_1", cwd=folder)
+    run_killed(sys.executable, "-c", DIE_WHILE_WRITING, *TRAIN, cwd=folder)
+    run_killed(sys.executable, "-c", DIE_IN_STAGE_2, "resume", RUNS / "SafeDrive-v0_1", cwd=folder)
     (folder / "output").write_text(run(SCRIPTS / "sb3-chac", "resume", RUNS / "SafeDrive-v0_2", cwd=folder))
     return folder
 
@@ -114,10 +119,10 @@ def check_wrapper(model: CHAC) -> None:
 
 def test_killed_while_writing_a_checkpoint_in_stage_1(killed):
     folder = killed / RUNS / "SafeDrive-v0_1" / "checkpoints"
-    assert {path.name for path in folder.iterdir()} == {"100", "200.tmp"}
-    assert not zipfile.is_zipfile(folder / "200.tmp" / "SafeDrive-v0.zip")
-    model = load(folder / "100")
-    assert model.num_timesteps == 100
+    assert {path.name for path in folder.iterdir()} == {"60", "120.tmp"}
+    assert not zipfile.is_zipfile(folder / "120.tmp" / "SafeDrive-v0.zip")
+    model = load(folder / "60")
+    assert model.num_timesteps == 60
     check_consistent(model)
     check_wrapper(model)
 
@@ -125,7 +130,7 @@ def test_killed_while_writing_a_checkpoint_in_stage_1(killed):
 def test_killed_in_stage_2(killed):
     folder = killed / RUNS / "SafeDrive-v0_2" / "checkpoints"
     checkpoint = newest_checkpoint(folder)
-    assert checkpoint is not None and 400 <= int(checkpoint.name) < TOTAL
+    assert checkpoint is not None and checkpoint.name == "240"
     model = load(checkpoint)
     assert model.stage == 2
     check_consistent(model)
@@ -210,14 +215,6 @@ def test_a_damaged_checkpoint_costs_what_is_said(killed, tmp_path, monkeypatch, 
     assert command == TRAIN and model == RUNS / "SafeDrive-v0_3" / "checkpoints" / older.name / "SafeDrive-v0.zip"
     (line,) = capsys.readouterr().err.splitlines()
     assert f"which costs {int(newest.name) - int(older.name)} steps" in line and "is damaged" in line
-
-
-def zoo_train(monkeypatch, *arguments: str) -> None:
-    """RL-Zoo3's command, in this process."""
-    from rl_zoo3.train import train
-
-    monkeypatch.setattr(sys, "argv", ["rl_zoo3", *arguments])
-    train()
 
 
 def test_more_steps_with_other_environments_and_normalization(tmp_path, monkeypatch, capsys):

@@ -43,9 +43,20 @@ def outcome(job: Job, success: bool = True) -> Outcome:
     return Outcome(files | ({"drives": suite_job.table(drives)} if job.keeps_drives else {}), b"model")
 
 
+# suite.py with fewer and shorter evaluations
+QUICK = f"""
+import runpy, sys
+sys.path.insert(0, {str(BENCHMARKS)!r})
+import suite_job
+suite_job.TEST_MAPS, suite_job.DRIVES = range(1000, 1002), (1000,)
+suite_job.EVALUATIONS, suite_job.VALIDATION_EPISODES, suite_job.CHECKPOINTS = 2, 1, 5
+runpy.run_path({str(BENCHMARKS / "suite.py")!r}, run_name="__main__")
+"""
+
+
 def command(tmp_path: Path, *arguments: str) -> list[str]:
     places = ["--results", str(tmp_path / "results"), "--work", str(tmp_path / "work")]
-    return [sys.executable, str(BENCHMARKS / "suite.py"), *arguments, *places]
+    return [sys.executable, "-c", QUICK, *arguments, *places]
 
 
 def test_one_scale_shrinks_all_budgets_and_nothing_else():
@@ -117,7 +128,8 @@ def test_a_full_disk_leaves_the_job_unfinished(tmp_path, monkeypatch):
     assert results.state(job) == ""
 
 
-def test_the_report_has_all_methods_and_names_what_contradicts_the_paper(tmp_path):
+def test_the_report_has_all_methods_and_names_what_contradicts_the_paper(tmp_path, monkeypatch):
+    monkeypatch.setattr(suite_report, "RESAMPLES", 50)
     results = suite.Results(tmp_path)
     jobs = [a_job(name, seed) for name in ("pvp", "dpvp", "chac", "chac-no-share") for seed in (0, 1)]
     for job in jobs:
@@ -148,7 +160,7 @@ def test_thinned_curves_keep_the_last_point():
 
 
 def test_a_killed_suite_goes_on_from_checkpoints_and_takes_its_processes_along(tmp_path):
-    arguments = command(tmp_path, "run", "--rows", "pvp", "--seeds", "1", "--scale", "0.02", "--jobs", "1")
+    arguments = command(tmp_path, "run", "--rows", "pvp", "--seeds", "1", "--scale", "0.008", "--jobs", "1")
     first = subprocess.Popen(arguments, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     logs = tmp_path / "work" / "pvp-0" / "logs" / "pvp"
 
@@ -165,12 +177,12 @@ def test_a_killed_suite_goes_on_from_checkpoints_and_takes_its_processes_along(t
     assert len(list(logs.glob("SafeDrive-v0_*"))) == 2  # the second resumed the first
     with (tmp_path / "results" / "pvp-0" / "episodes.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
-    assert len(rows) == len(suite_job.TEST_MAPS)
-    assert int(rows[0]["total_steps"]) == 1000
+    assert [row["scenario"] for row in rows] == ["1000", "1001"]
+    assert int(rows[0]["total_steps"]) == 400
     assert subprocess.run(arguments, capture_output=True, text=True).stdout.startswith("1 jobs: 1 done, 0 to do")
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize("number", [pytest.param(signal.SIGTERM, marks=pytest.mark.slow), signal.SIGINT])
 def test_a_signal_ends_the_suite_and_its_jobs_in_good_order(tmp_path, number):
     arguments = command(tmp_path, "run", "--rows", "pvp", "dpvp", "--seeds", "1", "--scale", "0.02", "--jobs", "1")
     process = subprocess.Popen(arguments, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
@@ -199,6 +211,7 @@ def test_a_failed_job_does_not_stop_the_others(tmp_path):
     assert (tmp_path / "results" / "human-0" / "episodes.csv").is_file()
 
 
+@pytest.mark.slow
 def test_a_ray_cluster_of_two_nodes_survives_the_loss_of_a_worker(tmp_path):
     pytest.importorskip("ray", reason='needs Ray: pip install "sb3-chac[ray]"')
     from ray.cluster_utils import Cluster

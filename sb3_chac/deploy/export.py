@@ -20,11 +20,12 @@ from torch import nn
 
 from sb3_chac.chac.policies import CONTROLS, CHACPolicy
 from sb3_chac.common.checks import check_action_space
-from sb3_chac.common.episodes import ModelDriver, NotEvaluable, make_env
-from sb3_chac.common.evaluation import scenario_list
 from sb3_chac.deploy.metadata import KEY, Input, Metadata, NotDeployable
 from sb3_chac.deploy.policy import OnnxPolicy
-from sb3_chac.evaluate import check_output, env_of, find_algorithm, find_normalization, load_model, parse_env_kwargs
+from sb3_chac.evaluate import check_output, parse_env_kwargs
+from sb3_chac.evaluation.episodes import ModelDriver, NotEvaluable, make_env
+from sb3_chac.evaluation.evaluation import scenario_list
+from sb3_chac.evaluation.models import env_of, find_algorithm, find_normalization, load_model
 
 OPSET = 17
 TOLERANCE = 1e-5  # of actions, as a share of half their range
