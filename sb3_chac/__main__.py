@@ -32,7 +32,9 @@ def main() -> None:
         print(USAGE)
         return
     if command not in COMMANDS:
-        sys.exit(f"{USAGE}\n\nsb3-chac: {command!r} is not a command, choose from {', '.join(COMMANDS)}.")
+        known = ", ".join(COMMANDS)
+        sys.stderr.write(f"sb3-chac: error: {command!r} is not a command, choose from {known} (sb3-chac --help).\n")
+        sys.exit(2)
     if command in OWN_COMMANDS:
         import_module(OWN_COMMANDS[command]).main(sys.argv[2:])
         return
