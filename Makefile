@@ -6,7 +6,7 @@ DEMO := logs/demo
 DEMO_RUN := $(DEMO)/chac/SafeDrive-v0_1
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: demo test test-slow lint type format bench clean
+.PHONY: demo test test-slow lint type format docs bench clean
 
 # The main job: train C-HAC on SafeDrive with the scripted driver as the human, through RL-Zoo3's own command; evaluate what was
 # learned on maps that it has not seen, beside the human-guided policy alone and the human; draw the curves and film a drive.
@@ -37,6 +37,10 @@ type: $(INSTALLED)
 format: $(INSTALLED)
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
+
+# The documentation, warnings being errors: docs/_build/html/index.html, static files that any web server can serve
+docs: $(INSTALLED)
+	$(BIN)/sphinx-build --fail-on-warning --keep-going --quiet -b html docs docs/_build/html
 
 # Hours: see benchmarks/README.md
 bench: $(INSTALLED)

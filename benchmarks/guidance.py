@@ -29,6 +29,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch as th
 import yaml
+from guidance_curves import load_run, read
 from rl_zoo3.utils import ALGOS, get_wrapper_class
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
@@ -38,6 +39,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 from sb3_chac import DSAC, InterventionWrapper
 from sb3_chac.common.guided import GuidedOffPolicyAlgorithm
 from sb3_chac.envs import ONE_PER_PROCESS
+from sb3_chac.evaluation import curves
+from sb3_chac.evaluation.curves import Method
 from sb3_chac.evaluation.evaluation import evaluate
 from sb3_chac.zoo.algorithms import hyperparams_file
 
@@ -53,7 +56,7 @@ GUIDED, SWITCH = 50_000, 20_000  # steps of D-PVP, and of C-HAC's stage 1
 AFTER_SWITCH = 50_000  # steps that the ablations are compared over
 
 
-class Method(NamedTuple):
+class Config(NamedTuple):
     algo: str
     steps: int
     title: str
@@ -63,16 +66,16 @@ class Method(NamedTuple):
 
 
 METHODS = {
-    "sac": Method("sac", 200_000, "SAC"),
-    "dsac": Method("dsac", 200_000, "DSAC"),
-    "pvp": Method("pvp", GUIDED, "PVP"),
-    "dpvp": Method("dpvp", GUIDED, "D-PVP"),
-    "dpvp-1k": Method("dpvp", GUIDED, "D-PVP, 1K human steps", budget=1000),
-    "dpvp-2k": Method("dpvp", GUIDED, "D-PVP, 2K human steps", budget=2000),
-    "chac-stage-1": Method("chac", SWITCH, "C-HAC, end of stage 1"),
-    "chac": Method("chac", 200_000, "C-HAC", {}, "chac-stage-1"),
-    "chac-no-share": Method("chac", SWITCH + AFTER_SWITCH, "C-HAC, No Share", {"shared_control": False}, "chac-stage-1"),
-    "chac-no-confidence": Method("chac", SWITCH + AFTER_SWITCH, "C-HAC, No Confidence", {"delta": 0.5}, "chac-stage-1"),
+    "sac": Config("sac", 200_000, "SAC"),
+    "dsac": Config("dsac", 200_000, "DSAC"),
+    "pvp": Config("pvp", GUIDED, "PVP"),
+    "dpvp": Config("dpvp", GUIDED, "D-PVP"),
+    "dpvp-1k": Config("dpvp", GUIDED, "D-PVP, 1K human steps", budget=1000),
+    "dpvp-2k": Config("dpvp", GUIDED, "D-PVP, 2K human steps", budget=2000),
+    "chac-stage-1": Config("chac", SWITCH, "C-HAC, end of stage 1"),
+    "chac": Config("chac", 200_000, "C-HAC", {}, "chac-stage-1"),
+    "chac-no-share": Config("chac", SWITCH + AFTER_SWITCH, "C-HAC, No Share", {"shared_control": False}, "chac-stage-1"),
+    "chac-no-confidence": Config("chac", SWITCH + AFTER_SWITCH, "C-HAC, No Confidence", {"delta": 0.5}, "chac-stage-1"),
 }
 
 # What of a policy acts when deterministic
@@ -194,12 +197,7 @@ def forget_rows_after(path: Path, step: int) -> None:
             writer.writerows(kept)
 
 
-def read(path: Path) -> list[dict[str, str]]:
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
-
-
-def is_finished(path: Path, method: Method, most_steps: int) -> bool:
+def is_finished(path: Path, method: Config, most_steps: int) -> bool:
     return path.exists() and int(read(path)[-1]["step"]) >= min(method.steps, most_steps)
 
 
@@ -230,22 +228,19 @@ def columns(runs: list[list[dict[str, str]]], key: str) -> np.ndarray:
 
 
 def report(args: argparse.Namespace) -> None:
-    """Table: last three evaluations, mean ± standard deviation over seeds. Curves: mean, shaded from least to greatest."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot as plt
-
-    figure, axes = plt.subplots(1, 4, figsize=(16, 3.4))
+    """Table: last three evaluations, mean ± standard deviation over seeds. Curves: see ``curves.draw``."""
     titles = {"success_rate": "success rate", "cost_mean": "safety cost", "return_mean": "return"}
+    drawn = []
     print("| method | seeds | steps | human steps | return | cost | success | training cost |")
     print("|---|---|---|---|---|---|---|---|")
     rows = []
     for name, method in METHODS.items():
-        paths = [args.results / f"{name}-{seed}.csv" for seed in args.seeds]
-        runs = [read(path) for path in paths if is_finished(path, method, args.steps)]
-        if not runs:
+        seeds = [seed for seed in args.seeds if is_finished(args.results / f"{name}-{seed}.csv", method, args.steps)]
+        if not seeds:
             continue
+        if not any(other.goes_on_from == name for other in METHODS.values()):
+            drawn.append(Method(method.title, [load_run(args.results, name, seed, method.goes_on_from) for seed in seeds]))
+        runs = [read(args.results / f"{name}-{seed}.csv") for seed in seeds]
         runs = [rows[: min(map(len, runs))] for rows in runs]
         scores = {key: columns(runs, key)[:, -3:].mean(axis=1) for key in titles}
         scores |= {key: columns(runs, key)[:, -1] for key in ("human_steps", "training_cost")}
@@ -257,22 +252,17 @@ def report(args: argparse.Namespace) -> None:
             f"| {text['cost_mean']} | {text['success_rate']} | {whole['training_cost']} |"
         )
         rows.append({"method": name, "seeds": len(runs), **{key: float(s.mean()) for key, s in scores.items()}})
-        for axis, key in zip(axes, [*titles, "training_cost"], strict=True):
-            curves = columns(runs, key)
-            (line,) = axis.plot(steps, curves.mean(axis=0), label=method.title)
-            axis.fill_between(steps, curves.min(axis=0), curves.max(axis=0), color=line.get_color(), alpha=0.12)
-            axis.set(title=titles.get(key, "safety cost of the training"), xlabel="environment steps")
     (args.results / "ablation.json").write_text(json.dumps(report_switch(args), indent=2) + "\n")
-    axes[0].legend(fontsize=7)
-    figure.tight_layout()
+    figure = curves.draw(drawn, (curves.RETURN, curves.SUCCESS, curves.COST, curves.TRAINING_COST))
+    figure.axes[-1].set_yscale("symlog", linthresh=10)
     figure.savefig(args.results / "curves.png", dpi=90)
     (args.results / "summary.json").write_text(json.dumps(rows, indent=2) + "\n")
 
 
 def report_switch(args: argparse.Namespace) -> list[dict[str, Any]]:
     """Table: what the switch to stage 2 costs in the steps after it, for C-HAC and its ablations (the paper's Figure 8)."""
-    end = SWITCH + AFTER_SWITCH
-    print(f"\n| to step {end // 1000}K | seeds | lowest return | drop | lowest success | training cost since the switch |")
+    titles = ("seeds", "lowest return", "drop", "lowest success", "training cost since the switch")
+    print(f"\n| in {AFTER_SWITCH // 1000}K steps after the switch | {' | '.join(titles)} |")
     print("|---|---|---|---|---|---|")
     rows = []
     for name, method in METHODS.items():
@@ -283,7 +273,9 @@ def report_switch(args: argparse.Namespace) -> list[dict[str, Any]]:
             before, after = args.results / f"{method.goes_on_from}-{seed}.csv", args.results / f"{name}-{seed}.csv"
             if not is_finished(after, method, args.steps):
                 continue
-            start, after_switch = read(before)[-1], [row for row in read(after) if int(row["step"]) <= end]
+            start = read(before)[-1]
+            end = int(start["step"]) + AFTER_SWITCH
+            after_switch = [row for row in read(after) if int(row["step"]) <= end]
             lowest = min(float(row["return_mean"]) for row in after_switch)
             drops.append(
                 {

@@ -3,7 +3,7 @@
     python benchmarks/suite.py run --suite table1 --seeds 3 --jobs 2      # stop it at any time, run it again, it goes on
     python benchmarks/suite.py run --suite table1 --scale 0.1             # all budgets a tenth
     python benchmarks/suite.py run --suite table1-metadrive --rows dpvp chac
-    python benchmarks/suite.py run --suite table1 --ray 127.0.0.1:6379    # on a Ray cluster (pip install "sb3-chac[ray]")
+    python benchmarks/suite.py run --suite table1 --ray 127.0.0.1:6379    # on a Ray cluster (pip install "ray>=2.50")
     python benchmarks/suite.py report --suite table1 --scale 0.1          # RESULTS.md and pictures from the CSVs
 
 Budgets and hyperparameters are those of hyperparams/<algo>.yml. Each job is `rl_zoo3 train` with checkpoints, then one
@@ -56,10 +56,11 @@ class Results:
     The CSVs of the jobs that are done.
 
     :param folder: of the suite
+    :param take_outdated: whether those made with other hyperparameters than today's count as done
     """
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
+    def __init__(self, folder: Path, take_outdated: bool = False) -> None:
+        self.folder, self.take_outdated = folder, take_outdated
 
     def path(self, job: Job) -> Path:
         return self.folder / job.name
@@ -74,7 +75,7 @@ class Results:
             return UNFINISHED
         except ValueError as error:
             return f"{error} Remove {self.path(job)} and run the suite again: what was trained is not trained again."
-        if rows[0]["fingerprint"] != suite_job.fingerprint(job):
+        if not self.take_outdated and rows[0]["fingerprint"] != suite_job.fingerprint(job):
             return (
                 f"{self.path(job)} was made with other hyperparameters than those that are there now. Restore those, or "
                 "remove it and run the suite again."
@@ -160,7 +161,7 @@ class OnRay:
         try:
             import ray
         except ImportError:
-            sys.exit('--ray: Ray is not installed. Run: pip install "sb3-chac[ray]"')
+            sys.exit('--ray: Ray is not installed. Run: pip install "ray>=2.50"')
         try:
             ray.init(address=address, log_to_driver=False)
         except (ConnectionError, ValueError, RuntimeError) as error:
@@ -258,7 +259,7 @@ def keep(job: Job, outcome: Outcome, results: Results, work: Path) -> None:
 def report(args: argparse.Namespace) -> None:
     import suite_report
 
-    suite_report.write(args.suite, args.scale, jobs_of(args), Results(args.results))
+    suite_report.write(args.suite, args.scale, jobs_of(args), Results(args.results, args.outdated))
 
 
 if __name__ == "__main__":
@@ -273,6 +274,9 @@ if __name__ == "__main__":
         "--jobs", type=int, default=2, metavar="N", help="how many at once, one thread each (default: %(default)s)"
     )
     parser.add_argument("--ray", metavar="ADDRESS", help="run them on this Ray cluster, as many at once as it has CPUs")
+    parser.add_argument(
+        "--outdated", action="store_true", help="report also what was made with other hyperparameters than today's"
+    )
     parser.add_argument("--results", type=Path, help="default: benchmarks/results/<suite>-<scale>")
     parser.add_argument("--work", type=Path, help="default: benchmarks/models/<suite>-<scale>")
     arguments = parser.parse_args()

@@ -2,18 +2,19 @@
 
 import warnings
 from collections import defaultdict
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
 import suite_job
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from rliable.library import get_interval_estimates
 from suite_job import Job
 
 import sb3_chac.envs  # noqa: F401  (registers our environments)
+from sb3_chac.evaluation import curves
 
 if TYPE_CHECKING:
     from suite import Results
@@ -103,11 +104,11 @@ def read(jobs: list[Job], results: "Results") -> tuple[dict[str, Method], list[s
         method = methods.setdefault(job.row.name, Method(job.row.title, [], [], []))
         method.jobs.append(job)
         method.episodes.append(results.read(job, "episodes"))
-        curves: dict[str, list[tuple[float, float]]] = defaultdict(list)
+        points: dict[str, list[tuple[float, float]]] = defaultdict(list)
         if job.row.algo:
             for row in results.read(job, "curves"):
-                curves[row["quantity"]].append((float(row["step"]), float(row["value"])))
-        method.curves.append({name: np.array(points) for name, points in curves.items()})
+                points[row["quantity"]].append((float(row["step"]), float(row["value"])))
+        method.curves.append({name: np.array(rows) for name, rows in points.items()})
     return methods, problems
 
 
@@ -133,6 +134,7 @@ def write(suite: str, scale: float, jobs: list[Job], results: "Results") -> None
         f"{suite_job.TEST_MAPS[-1]}, without the human; in brackets 95 % bootstrap intervals of the mean (rliable, seeds "
         "resampled map by map). In italics the paper's figures, which are MetaDrive's at the full budgets.",
         "",
+        *outdated(methods),
         *main_table(methods),
         "",
         *claims(methods),
@@ -150,6 +152,23 @@ def write(suite: str, scale: float, jobs: list[Job], results: "Results") -> None
     text += ["Versions: " + "; ".join(versions), ""]
     (results.folder / "RESULTS.md").write_text("\n".join(text))
     print(f"Saved {results.folder / 'RESULTS.md'}")
+
+
+def outdated(methods: dict[str, Method]) -> list[str]:
+    """
+    :return: a sentence that names the methods whose hyperparameters have changed since, if there are any
+    """
+    titles = [
+        method.title
+        for method in methods.values()
+        if any(
+            rows[0]["fingerprint"] != suite_job.fingerprint(job)
+            for job, rows in zip(method.jobs, method.episodes, strict=True)
+        )
+    ]
+    return (
+        [f"Made with the hyperparameters of that time, which have changed since: {', '.join(titles)}.", ""] if titles else []
+    )
 
 
 def main_table(methods: dict[str, Method]) -> list[str]:
@@ -203,67 +222,94 @@ def claims(methods: dict[str, Method]) -> list[str]:
 
 # Pictures
 
-LINES = ["-", "--", ":"]  # one more for every ten methods: as many colours has the cycle
+# What the x axis counts, and who belongs there; C-HAC's ablations have a picture of their own
+GROUPS = {
+    "steps of reinforcement learning": ("sac", "ppo", "sac_lag", "ppo_lag", "dsac", "gail", "chac"),
+    "steps with a human at hand": ("hg_dagger", "iwr", "pvp", "dpvp"),
+    "gradient steps on demonstrations": ("bc", "cql"),
+}
+WINDOWS = 12  # of a training, whose takeover rates are drawn
 
 
-def draw_curves(axes: Axes, methods: dict[str, Method], quantity: str, per_step: bool = False) -> None:
+def chosen(methods: dict[str, Method], names: Iterable[str], *quantities: str) -> list[curves.Method]:
     """
-    Mean over seeds, shaded from least to greatest.
-
-    :param per_step: draw it divided by the number of steps
+    :return: those of the methods that have all of the quantities, for ``curves.draw_panel``
     """
-    for number, method in enumerate(methods.values()):
-        curves = [curve[quantity] for curve in method.curves if len(curve.get(quantity, ())) > 1]
-        if not curves:
-            continue
-        first, last = max(c[0, 0] for c in curves), min(c[-1, 0] for c in curves)
-        steps = np.unique(np.concatenate([c[:, 0] for c in curves]).clip(first, last))
-        values = np.array([np.interp(steps, *curve.T) for curve in curves])
-        if per_step:
-            values = values / np.maximum(steps, 1)
-        style = {"color": f"C{number % 10}", "linestyle": LINES[number // 10]}
-        axes.plot(steps, values.mean(axis=0), label=method.title, linewidth=1.3, **style)
-        axes.fill_between(steps, values.min(axis=0), values.max(axis=0), color=style["color"], alpha=0.12)
-    axes.set_xlabel("steps of the training")
-    axes.grid(alpha=0.25)
+    found = []
+    for name in names:
+        runs = (
+            [run for run in methods[name].curves if all(len(run.get(q, ())) > 1 for q in quantities)]
+            if name in methods
+            else []
+        )
+        if runs:
+            found.append(curves.Method(methods[name].title, runs))
+    return found
 
 
 def learning(methods: dict[str, Method], results: "Results") -> Figure:
-    figure = Figure(figsize=(13, 4), layout="constrained")
-    titles = {"return": "return", "success": "success rate", "safety/safety_cost": "safety cost of the training"}
-    for axes, (quantity, title) in zip(figure.subplots(1, 3), titles.items(), strict=True):
-        draw_curves(axes, {name: method for name, method in methods.items() if not name.startswith("chac-")}, quantity)
-        axes.set_title(title)
-        axes.set_xscale("log")  # the person's methods take a tenth of the steps
-        if quantity == "safety/safety_cost":
-            axes.set_yscale("symlog", linthresh=10)
-            axes.set_ylim(bottom=0)
-    handles = {label: line for axes in figure.axes for line, label in zip(*axes.get_legend_handles_labels(), strict=True)}
-    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=7, fontsize="small")
+    groups = {title: found for title, names in GROUPS.items() if (found := chosen(methods, names, curves.RETURN))}
+    figure = Figure(figsize=(13, 3.7 * len(groups)), layout="constrained")
+    quantities = (curves.RETURN, curves.SUCCESS, curves.TRAINING_COST)
+    for part, (title, found) in zip(figure.subfigures(len(groups), 1, squeeze=False).flat, groups.items(), strict=True):
+        handles: dict[str, Any] = {}
+        for axes, quantity in zip(part.subplots(1, 3), quantities, strict=True):
+            handles |= curves.draw_panel(axes, found, quantity)
+            axes.set_xlabel(title)
+            if not axes.lines:
+                axes.set_axis_off()  # no costs without an environment
+        part.legend(handles.values(), handles.keys(), loc="outside right center", fontsize="small", handlelength=3)
     return figure
 
 
+def rate_per_window(run: dict[str, np.ndarray]) -> np.ndarray:
+    """
+    :return: middle of each window of the training, and the human's share of the steps in it; shape (n, 2)
+    """
+    steps, human = run[curves.HUMAN_STEPS].T
+    ends = np.linspace(0, steps[-1], WINDOWS + 1)
+    driven = np.interp(ends, np.append(0, steps), np.append(0, human))
+    return np.column_stack([(ends[1:] + ends[:-1]) / 2, np.diff(driven) / np.diff(ends)])
+
+
 def takeovers(methods: dict[str, Method], results: "Results") -> Figure | None:
-    guided = {n: m for n, m in methods.items() if any("takeover/human_steps" in curve for curve in m.curves)}
+    """A panel for each method: its own steps, and what the human drove of them in each part of the training."""
+    names = [name for name in methods if not name.startswith("chac-")]
+    guided = chosen(methods, names, curves.HUMAN_STEPS)
     if not guided:
         return None
-    figure = Figure(figsize=(6, 4), layout="constrained")
-    axes = figure.subplots()
-    draw_curves(axes, guided, "takeover/human_steps", per_step=True)
-    axes.set(title="takeover rate: the human's share of the steps so far", ylim=(0, None), xscale="log")
-    axes.legend(fontsize="small")
+    figure = Figure(figsize=(3.2 * len(guided), 3.4), layout="constrained")
+    for number, (axes, method) in enumerate(
+        zip(figure.subplots(1, len(guided), squeeze=False, sharey=True).flat, guided, strict=True)
+    ):
+        colour, _ = curves.style(number)
+        rates = [rate_per_window(run) for run in method.runs]
+        for rate in rates:
+            axes.plot(*rate.T, color=colour, alpha=0.35, linewidth=1)
+        axes.plot(*np.mean(rates, axis=0).T, color=colour, linewidth=2, marker="o", markersize=4)
+        axes.set_title(method.label, fontsize="medium")
+        axes.set(xlabel="environment steps", ylim=(0, 1.03), xlim=(0, None))
+        axes.xaxis.set_major_formatter(lambda value, _: f"{value / 1000:g}K")
+        axes.grid(alpha=0.25)
+    figure.axes[0].set_ylabel("human's share of the steps")
     return figure
 
 
 def ablation(methods: dict[str, Method], results: "Results") -> Figure | None:
-    chosen = {name: method for name, method in methods.items() if name.startswith("chac")}
-    if len(chosen) < 2:
+    """A column for each quantity, a row for each variant beside C-HAC, so that no line hides another."""
+    variants = [name for name in methods if name.startswith("chac-")]
+    if not variants or "chac" not in methods:
         return None
-    figure = Figure(figsize=(11, 4), layout="constrained")
-    for axes, quantity in zip(figure.subplots(1, 3), ("return", "success", "safety/safety_cost"), strict=True):
-        draw_curves(axes, chosen, quantity)
-        axes.set_title({"safety/safety_cost": "safety cost of the training"}.get(quantity, quantity))
-    figure.axes[0].legend(fontsize="small")
+    quantities = (curves.RETURN, curves.SUCCESS, curves.TRAINING_COST)
+    figure = Figure(figsize=(12, 3.3 * len(variants)), layout="constrained")
+    grid = figure.subplots(len(variants), 3, squeeze=False, sharex=True, sharey="col")
+    for row, variant in zip(grid, variants, strict=True):
+        pair = chosen(methods, ("chac", variant), curves.RETURN)
+        for axes, quantity in zip(row, quantities, strict=True):
+            handles = curves.draw_panel(axes, pair, quantity)
+        row[0].legend(handles.values(), handles.keys(), fontsize="small", handlelength=3, loc="lower right")
+    for axes in grid[-1]:
+        axes.set_xlabel("environment steps")
     return figure
 
 

@@ -8,7 +8,7 @@ from importlib import import_module
 
 # Name -> module
 OWN_COMMANDS = {
-    **{name: f"sb3_chac.{name}" for name in ("drive", "evaluate", "resume", "plot", "demos")},
+    **{name: f"sb3_chac.{name}" for name in ("drive", "evaluate", "resume", "plot", "compare", "demos")},
     **{name: f"sb3_chac.deploy.{name}" for name in ("export",)},
 }
 COMMANDS = ("train", "enjoy", "plot_train", "plot_from_file", "all_plots", *OWN_COMMANDS)
@@ -20,10 +20,45 @@ RL-Zoo3's commands with the algorithms of sb3_chac, and
   evaluate MODEL.zip    a model or an expert on held-out scenarios
   resume RUN_FOLDER     go on with a training that was interrupted or killed, from its newest checkpoint
   plot RUN_FOLDER       its curves: return, success rate, safety cost, what the human drove
+  compare RUN RUN ...   several runs in one figure and table, with intervals over seeds
   demos COMMAND         demonstrations: record them, look at them, drive them again
   export MODEL.zip FILE.onnx  a model as one ONNX file, for a vehicle
+With --gym-packages MODULE [MODULE ...], each imports these first: they register environments of yours.
 'sb3-chac train --help' lists the arguments, so does --help of the others.
 Models, replay buffers, run folders and hyperparameters files are code (docs/loading.md): open those that you trust only."""
+
+
+def import_packages(command: str, arguments: list[str]) -> list[str]:
+    """
+    Import what ``--gym-packages`` names, as RL-Zoo3's commands do.
+
+    :param command: one of ours
+    :param arguments: of it
+    :return: without the option; an environment that is known only now is called module:ID, so that other processes find it
+    """
+    import argparse
+
+    parser = argparse.ArgumentParser("sb3-chac", add_help=False, allow_abbrev=False)
+    parser.add_argument("--gym-packages", nargs="+", default=[])
+    parser.add_argument("--env")
+    named, _ = parser.parse_known_args(arguments)
+    if not named.gym_packages:
+        return arguments
+    from gymnasium import registry
+
+    from sb3_chac.common.naming import import_named
+
+    before, start = set(registry), arguments.index("--gym-packages")
+    for module in named.gym_packages:
+        try:
+            import_named(module)
+        except ImportError as error:
+            parser.exit(2, f"sb3-chac: error: --gym-packages {module}: {error}. Install it, or run this in its folder.\n")
+        new = set(registry) - before
+        if command != "drive":  # which makes it in this process, by its plain name
+            arguments = [f"{module}:{text}" if text == named.env and text in new else text for text in arguments]
+        before |= new
+    return arguments[:start] + arguments[start + 1 + len(named.gym_packages) :]
 
 
 def main() -> None:
@@ -36,7 +71,7 @@ def main() -> None:
         sys.stderr.write(f"sb3-chac: error: {command!r} is not a command, choose from {known} (sb3-chac --help).\n")
         sys.exit(2)
     if command in OWN_COMMANDS:
-        import_module(OWN_COMMANDS[command]).main(sys.argv[2:])
+        import_module(OWN_COMMANDS[command]).main(import_packages(command, sys.argv[2:]))
         return
 
     from sb3_chac.zoo import register

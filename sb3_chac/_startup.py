@@ -21,6 +21,7 @@ _EXTENSIONS = {
     "rl_zoo3.utils": "add_algorithms",
     "rl_zoo3.exp_manager": "add_experiments",
     "rl_zoo3.train": "add_training",
+    "huggingface_sb3.push_to_hub": "add_metadata",
 }
 
 

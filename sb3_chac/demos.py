@@ -52,14 +52,17 @@ def make_parser() -> argparse.ArgumentParser:
     new.add_argument("--steps", type=int, default=50_000, metavar="N", help="how many at least (default: %(default)s)")
     who = new.add_argument_group("who acts")
     who.add_argument(
-        "--expert", required=True, metavar="NAME|MODEL.zip", help="an expert of the environment, e.g. scripted, or a model"
+        "--expert",
+        required=True,
+        metavar="NAME|MODEL.zip",
+        help="an expert of the environment, e.g. scripted, package.module:function, or a model",
     )
     who.add_argument("--novice", type=Path, metavar="MODEL.zip", help="who drives unless the expert takes over")
     who.add_argument(
         "--rule",
         default="risk",
-        choices=("risk", "disagreement", "always", "never"),
-        help="when the expert takes over (%(default)s)",
+        metavar="NAME",
+        help="when the expert takes over: risk, disagreement, always, never or package.module:function (%(default)s)",
     )
     where = new.add_argument_group("where")
     where.add_argument("--env", default=DEFAULT_ENV, metavar="ID", help="environment, also module:ID (default: %(default)s)")

@@ -37,7 +37,7 @@ def make_parser() -> argparse.ArgumentParser:
     )
     who = parser.add_argument_group("who acts (one of the two)")
     who.add_argument("model", nargs="?", type=Path, metavar="MODEL.zip", help="a model saved by Stable-Baselines3")
-    who.add_argument("--expert", metavar="NAME", help="an expert of the environment, e.g. scripted or scripted-ideal")
+    who.add_argument("--expert", metavar="NAME", help="an expert of the environment, as scripted, or package.module:function")
     who.add_argument("--algo", metavar="NAME", help="algorithm of the model as RL-Zoo3 calls it (default: read from the file)")
     who.add_argument("--policy", choices=CONTROLS, help="who acts of a C-HAC model in stage 2 (default: as in its training)")
     who.add_argument(
@@ -45,7 +45,8 @@ def make_parser() -> argparse.ArgumentParser:
         nargs="+",
         default=[],
         metavar="NAME",
-        help="compare with these on the same episodes: experts, and guided, self or shared of the same C-HAC model",
+        help="compare with these on the same episodes: experts (also package.module:function), and guided, self or shared "
+        "of the same C-HAC model",
     )
     where = parser.add_argument_group("where")
     where.add_argument(

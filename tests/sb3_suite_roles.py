@@ -59,6 +59,7 @@ NOT_APPLICABLE: list[tuple[tuple[str, ...], str, str]] = [
     ((*FROM_DATASETS,), "obs_space3", NO_DICT),
     ((*FROM_DATASETS,), "test_identity_spaces", BOX_ONLY),
     ((*FROM_DATASETS,), "test_discrete_obs_space", BOX_ONLY),
+    (("BC",), "test_action_spaces[CartPole", "takes Discrete actions, too, with another loss"),
     (IMITATING, "test_features_extractor_target_net", NO_CRITIC),
     (IMITATING, "test_train_eval_mode.py", NO_CRITIC),
     (IMITATING, "test_save_load_policy", NO_CRITIC),

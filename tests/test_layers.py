@@ -21,11 +21,11 @@ LAYERS = (
     {"datasets"},
     {"deploy"},
     {"cockpit"},
-    {"cli", "evaluate", "drive", "resume", "plot", "demos"},
+    {"cli", "evaluate", "drive", "resume", "plot", "compare", "demos"},
     {"__main__", "_startup"},
 )
 PARENTS = {"dpvp": {"dsac"}, "chac": {"dpvp"}, "hg_dagger": {"bc"}, "iwr": {"hg_dagger", "bc"}}  # an algorithm derives from it
-HELPERS = {("drive", "evaluate"), ("demos", "evaluate"), ("plot", "evaluate")}
+HELPERS = {("drive", "evaluate"), ("demos", "evaluate"), ("plot", "evaluate"), ("compare", "evaluate"), ("compare", "plot")}
 
 
 class Import(NamedTuple):

@@ -21,7 +21,7 @@ from sb3_chac.evaluation.evaluation import evaluate
 
 needs_metadrive = pytest.mark.skipif(
     importlib.util.find_spec("metadrive") is None,
-    reason='MetaDrive is not installed: pip install "sb3-chac[metadrive]" (its wheel is for Python up to 3.11)',
+    reason="MetaDrive is not installed: pip install metadrive-simulator==0.4.3 (its wheel is for Python up to 3.11)",
 )
 
 

@@ -9,7 +9,7 @@ from sb3_chac.envs.metadrive.env import LIDAR_REACH, N_LIDAR, OFFSET, ROUTE, SCA
 
 needs_metadrive = pytest.mark.skipif(
     importlib.util.find_spec("metadrive") is None,
-    reason='MetaDrive is not installed: pip install "sb3-chac[metadrive]" (its wheel is for Python up to 3.11)',
+    reason="MetaDrive is not installed: pip install metadrive-simulator==0.4.3 (its wheel is for Python up to 3.11)",
 )
 WIDTH, LANE = 10.5, 3.5  # [m] of the road and of its three lanes
 

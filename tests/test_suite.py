@@ -213,7 +213,7 @@ def test_a_failed_job_does_not_stop_the_others(tmp_path):
 
 @pytest.mark.slow
 def test_a_ray_cluster_of_two_nodes_survives_the_loss_of_a_worker(tmp_path):
-    pytest.importorskip("ray", reason='needs Ray: pip install "sb3-chac[ray]"')
+    pytest.importorskip("ray", reason='needs Ray: pip install "ray>=2.50"')
     from ray.cluster_utils import Cluster
 
     cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})

@@ -21,6 +21,7 @@ from sb3_chac.dpvp.dpvp import DPVP
 
 SelfCHAC = TypeVar("SelfCHAC", bound="CHAC")
 
+QUIET_STEPS = 5000  # of stage 2 without pi_r, after which a warning says so
 MOST_CHOICES = 1000  # steps of which the logger is told who drove, at most
 
 
@@ -248,6 +249,8 @@ class CHAC(DPVP):
         self.self_update = TargetUpdate(self.self_actor, self.self_actor_target)
         self.self_average_update = TargetUpdate(self.self_actor, self.policy.averaged_self_actor)
         # Since the logger took them, or the latest: nobody may ever take them
+        # Steps of stage 2 and the highest confidence in them, until pi_r acts or a warning was given
+        self.waiting: tuple[int, float] | None = (0, 0.0)
         self.choices: deque[dict[str, np.ndarray]] = deque(maxlen=MOST_CHOICES)
         self.watch = RelapseWatch(self.relapse_window) if self.relapse_window else None
 
@@ -446,7 +449,27 @@ class CHAC(DPVP):
         if self.policy.last_choice is not None:
             choice = self.policy.last_choice._asdict()
             self.choices.append({name: values.cpu().numpy() for name, values in choice.items() if name != "actions"})
+            self._wait_for_self_policy(self.choices[-1])
         return sampled
+
+    def _wait_for_self_policy(self, choice: dict[str, np.ndarray]) -> None:
+        """
+        Warn, once, if pi_r does not act in the first ``QUIET_STEPS`` steps of stage 2, which then is no more than stage 1.
+
+        :param choice: of a step, as in ``choices``
+        """
+        if self.waiting is None or self.delta == 0:
+            return
+        steps, highest = self.waiting
+        steps, highest = steps + len(choice["confidence"]), max(highest, float(choice["confidence"].max()))
+        self.waiting = None if choice["self_drives"].any() else (steps, highest)
+        if self.waiting is not None and steps >= QUIET_STEPS:
+            self.waiting = None
+            warnings.warn(
+                f"C-HAC: the self-learning policy has not acted in the first {steps} steps of stage 2. Its confidence reached "
+                f"{highest:.2f} and must exceed 1 - delta = {1 - self.delta:.2f}: lower sigma_scale ({self.sigma_scale:g}), "
+                f"or anchor_coef ({self.anchor_coef:g}) if it does what the guided one does, or raise delta ({self.delta:g})."
+            )
 
     def predict(
         self,

@@ -25,7 +25,7 @@ from PIL import Image
 try:
     from aiohttp import WSCloseCode, WSMsgType, web
 except ImportError as error:
-    raise RuntimeError('--serve needs aiohttp: pip install "sb3-chac[cockpit]".') from error
+    raise RuntimeError('--serve needs aiohttp: pip install "aiohttp>=3.10".') from error
 
 from sb3_chac.cockpit.browser import Address, BadMessage, Browser, Held, Wish, is_number, parse
 from sb3_chac.cockpit.devices import Clock

@@ -16,7 +16,9 @@ from stable_baselines3.common.utils import FloatSchedule, check_for_correct_spac
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 import sb3_chac.envs  # noqa: F401  (registers our environments)
+from sb3_chac.common.naming import is_name
 from sb3_chac.envs.driving.corridors import corridors_remedy
+from sb3_chac.human.experts import make_expert
 
 # Stored with a model, but of no use for acting (a schedule may not even load in another Python version)
 NOT_FOR_ACTING = {
@@ -226,6 +228,11 @@ class Runner:
             return ModelDriver(policy, self.env, self.task.normalize)
         if not isinstance(policy, str):
             return policy
+        if is_name(policy):
+            try:
+                return make_expert(policy, self.env)
+            except ValueError as error:
+                raise NotEvaluable(str(error)) from error
         if not hasattr(self.env.unwrapped, "scripted_driver"):
             raise NotEvaluable(f"expert {policy!r}: {self.env.unwrapped} has no scripted drivers.")
         try:

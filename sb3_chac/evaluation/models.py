@@ -137,7 +137,7 @@ def find_normalization(model: Path, env_id: str, env: gym.Env) -> tuple[Path, Ve
     :return: where RL-Zoo3 leaves the statistics of a model's observations, and the VecNormalize there, None if there is none
     :raises NotEvaluable: if the file cannot be read
     """
-    path = model.parent / EnvironmentName(env_id) / "vecnormalize.pkl"
+    path = model.parent / EnvironmentName(env_id.rpartition(":")[2]) / "vecnormalize.pkl"
     if not path.is_file():
         return path, None
     try:

@@ -14,6 +14,8 @@ from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.type_aliases import PolicyPredictor
 from stable_baselines3.common.vec_env import VecTransposeImage
 
+from sb3_chac.common.naming import is_name, named_object
+
 
 class Expert(Protocol):
     """What drives in the human's place. It may also have ``time_to_trouble(observation, action)``, see ``RiskRule``."""
@@ -106,13 +108,19 @@ def within(seconds: float | None, function: Callable[..., Any], *args: Any, **kw
 def make_expert(expert: Any, env: gym.Env) -> Expert:
     """
     :param expert: a name of a scripted driver that ``env`` has ("scripted", "scripted-ideal"), a loaded model (anything
-        with SB3's ``predict``), an ``Expert``, or a function observation -> action
+        with SB3's ``predict``), an ``Expert``, a function observation -> action, or "package.module:name", which names one of
+        these or a class, of which ``env`` gets an object of its own: ``Class(env)``
     :param env: the environment that the expert is to drive
     :return: an expert with ``reset``
     :raises ValueError: for anything else, and for a model whose spaces are not those of ``env``
     """
     check_expert(expert, env)
-    if isinstance(expert, str):
+    if is_name(expert):
+        expert = named_object("expert", expert)
+        if isinstance(expert, type):
+            expert = expert(env)
+        check_expert(expert, env)
+    elif isinstance(expert, str):
         expert = env.unwrapped.scripted_driver(expert)  # type: ignore[attr-defined]
     if hasattr(expert, "reset"):
         return expert
@@ -130,11 +138,16 @@ def check_expert(expert: Any, env: gym.Env) -> None:
             f"expert: {os.fspath(expert)!r} is a file. Load the model first with its class and pass it, "
             f"e.g. expert=SAC.load({os.fspath(expert)!r})."
         )
-    if isinstance(expert, str):
+    if is_name(expert):
+        found = named_object("expert", expert)
+        if not isinstance(found, type):
+            check_expert(found, env)
+    elif isinstance(expert, str):
         if not hasattr(env.unwrapped, "scripted_driver"):
             raise ValueError(
                 f"expert: {type(env.unwrapped).__name__} has no scripted driver, so expert={expert!r} does not exist. "
-                "Pass a trained model (expert=SAC.load(...)) or a function observation -> action instead."
+                "Pass a trained model (expert=SAC.load(...)), a function observation -> action, or the name of one, "
+                '"package.module:function", instead.'
             )
     elif isinstance(expert, type) or not (callable(expert) or hasattr(expert, "predict")):
         raise ValueError(

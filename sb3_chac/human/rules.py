@@ -11,6 +11,7 @@ from gymnasium import spaces
 
 from sb3_chac.common.arguments import checked
 from sb3_chac.common.checks import check_action_space, check_integer, check_range
+from sb3_chac.common.naming import is_name, named_object
 
 RULE_NAMES = ("risk", "disagreement", "always", "never")
 
@@ -170,8 +171,9 @@ def scale_action(action: np.ndarray, action_space: spaces.Box) -> np.ndarray:
 def make_rule(rule: Any, env: gym.Env, expert: Any, rule_kwargs: dict[str, Any] | None = None) -> TakeoverRule:
     """
     :param rule: "risk" (``RiskRule`` with the expert's predictor), "disagreement" (``DisagreementRule`` with threshold 0.3),
-        "always", "never", a ``TakeoverRule`` (of a ``RiskRule`` each environment gets its own copy), or a function
-        (observation, novice action, expert action) -> bool
+        "always", "never", a ``TakeoverRule`` (of a ``RiskRule`` each environment gets its own copy), a function
+        (observation, novice action, expert action) -> bool, or "package.module:name", which names one of these or a class, of
+        which each environment gets an object of its own: ``Class(**rule_kwargs)``
     :param env: the environment, for its action space
     :param expert: the expert of the environment, from ``make_expert``
     :param rule_kwargs: of "risk" (e.g. take_over_below) or "disagreement" (threshold)
@@ -179,6 +181,11 @@ def make_rule(rule: Any, env: gym.Env, expert: Any, rule_kwargs: dict[str, Any] 
     :raises ValueError: for anything else, and for "risk" if the expert has no ``time_to_trouble``
     """
     check_rule(rule, expert, rule_kwargs)
+    if is_name(rule):
+        rule = named_object("rule", rule)
+        if isinstance(rule, type):
+            rule = rule(**(rule_kwargs or {}))
+        check_rule(rule, expert)
     if isinstance(rule, str) and rule in CONFIGURABLE:
         return CONFIGURABLE[rule](getattr(expert, "time_to_trouble", None), env.action_space, **(rule_kwargs or {}))
     if isinstance(rule, RiskRule):
@@ -204,10 +211,15 @@ def check_rule(rule: Any, expert: Any, rule_kwargs: dict[str, Any] | None = None
     :param rule_kwargs: see ``make_rule``
     :raises ValueError: see ``make_rule``
     """
+    if is_name(rule):
+        found = named_object("rule", rule)
+        if not isinstance(found, type):
+            check_rule(found, expert, rule_kwargs)
+        return
     if isinstance(rule, type) or not (callable(rule) or (isinstance(rule, str) and rule in RULE_NAMES)):
         raise ValueError(
-            f"rule must be one of {', '.join(map(repr, RULE_NAMES))}, a TakeoverRule or a function (observation, novice "
-            f"action, expert action) -> bool, got {rule!r}."
+            f"rule must be one of {', '.join(map(repr, RULE_NAMES))}, a TakeoverRule, a function (observation, novice "
+            f'action, expert action) -> bool or the name of one, "package.module:function", got {rule!r}.'
         )
     if isinstance(rule, str) and rule == "risk" and not (isinstance(expert, str) or hasattr(expert, "time_to_trouble")):
         raise ValueError(

@@ -3,6 +3,7 @@
 import contextlib
 import functools
 import importlib
+import os
 import sys
 from types import ModuleType
 
@@ -61,6 +62,8 @@ def add_training(train: ModuleType) -> None:
     from sb3_chac.envs import ENVIRONMENTS
     from sb3_chac.zoo.errors import one_line
 
+    if "--gym-packages" in sys.argv and os.getcwd() not in sys.path:
+        sys.path.append(os.getcwd())  # where a user's own environment may be
     command = train.train
     if hasattr(command, "__wrapped__"):
         return
@@ -75,3 +78,13 @@ def add_training(train: ModuleType) -> None:
                 command()
 
     train.train = checked_command  # type: ignore[attr-defined]
+
+
+def add_metadata(push_to_hub: ModuleType) -> None:
+    """
+    Give ``rl_zoo3.push_to_hub`` the function that it imports: later versions call it otherwise, and return an object.
+
+    :param push_to_hub: ``huggingface_sb3.push_to_hub``
+    """
+    if not hasattr(push_to_hub, "generate_metadata"):
+        push_to_hub.generate_metadata = lambda *args: push_to_hub._generate_metadata(*args).to_dict()  # type: ignore[attr-defined]

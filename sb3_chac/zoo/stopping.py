@@ -37,7 +37,7 @@ def one_sentence(command: str) -> Iterator[None]:
         stop(signal.SIGINT)
     finally:
         if is_main:
-            signal.signal(signal.SIGTERM, before)
+            signal.signal(signal.SIGTERM, signal.SIG_DFL if before is None else before)
 
 
 def known_options(arguments: Sequence[str]) -> argparse.Namespace:

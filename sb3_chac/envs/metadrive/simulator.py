@@ -32,7 +32,7 @@ def check_installed() -> None:
     """
     if importlib.util.find_spec("metadrive") is None:
         raise gym.error.DependencyNotInstalled(
-            f'MetaDriveSafety-v0 needs MetaDrive {VERSION} (Python 3.11): pip install "sb3-chac[metadrive]".'
+            f"MetaDriveSafety-v0 needs MetaDrive {VERSION} (Python 3.11): pip install metadrive-simulator==0.4.3."
         )
     import pygame
 
