@@ -4,14 +4,15 @@
     python benchmarks/cockpit.py drive --env MetaDriveSafety-v0
     python benchmarks/cockpit.py browser --minutes 3         # the same in a Chromium, served on loopback
     python benchmarks/cockpit.py report
-    python benchmarks/cockpit.py pictures                    # those of the operator's guide
+    python benchmarks/cockpit.py pictures                    # of the guide; of the page too if there is a Chromium
 
 An emulated person presses and lets go keys at random moments, takes over and hands back. All else is what ``sb3-chac drive``
 does, with SDL's dummy display. Two CSVs in benchmarks/results/cockpit/ get a row per event and per step of the environment:
 <env>-events.csv, from the event in SDL's queue to the moment at which the environment begins the first step that is driven
 with it; <env>-steps.csv, the moments of the steps, the gradient steps that were owed, what the car waited for, and the
 window's frames. browser.csv gets a row per measured time: "round trip" of a message from the page and back; "shown", from a
-key to the page showing that the driving end has it; and "applied", until the page shows that it was driven.
+key to the page showing that the driving end has it; and "applied", until the page shows that it was driven; "touch shown" and
+"touch applied" are the same from a thumb that touches the throttle on the screen.
 It wants a machine with two cores that does nothing else; the load average is in the rows.
 """
 
@@ -46,6 +47,7 @@ from sb3_chac.cockpit.window import Window
 RESULTS = Path(__file__).parent / "results" / "cockpit"
 PICTURES = Path(command.__file__).parent / "cockpit" / "images"
 KEYS = (pygame.K_LEFT, pygame.K_RIGHT, pygame.K_UP, pygame.K_DOWN, pygame.K_SPACE)
+OLD = {"chac": ("--env-kwargs", "corridors:False")}  # without which this agent was trained
 PERIOD = 0.1  # [s] of a step, as the environments say
 VERSIONS = " ".join(
     f"{name}={importlib.metadata.version(name)}" for name in ("sb3_chac", "torch", "numpy", "pygame-ce", "stable-baselines3")
@@ -145,12 +147,15 @@ PING = """() => new Promise((resolve) => {
   send({ ping: 0 });
 })"""
 WATCH = """() => {
-  window.seen = { shown: [], applied: [] };
+  window.seen = { shown: [], applied: [], "touch shown": [], "touch applied": [] };
   const begun = {};
-  addEventListener("keydown", () => { begun.shown = begun.applied = performance.now(); }, true);
+  let by = "";
+  const begin = (how) => () => { by = how; begun.shown = begun.applied = performance.now(); };
+  addEventListener("keydown", begin(""), true);
+  addEventListener("pointerdown", begin("touch "), true);
   for (const [kind, row] of [["shown", "input"], ["applied", "applied"]]) {
     new MutationObserver(() => {
-      if (begun[kind]) window.seen[kind].push(performance.now() - begun[kind]);
+      if (begun[kind]) window.seen[by + kind].push(performance.now() - begun[kind]);
       begun[kind] = null;
     }).observe(byId(row).querySelectorAll(".bar div")[1], { attributes: true });
   }
@@ -170,13 +175,15 @@ def measure_browser(env: str, minutes: float) -> None:
     def drive_in_chromium() -> None:
         from playwright.sync_api import sync_playwright
 
-        path = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))))
         with sync_playwright() as playwright:
-            browser = playwright.chromium.launch(executable_path=path, args=["--no-sandbox"])
-            page = browser.new_page(viewport={"width": 1200, "height": 780})
+            browser = playwright.chromium.launch(executable_path=chromium(), args=["--no-sandbox"])
+            page = browser.new_page(viewport={"width": 1200, "height": 780}, has_touch=True)
             page.goto(server.address.url(server.driver_token))
             page.wait_for_selector("text=You are at the wheel")
             page.keyboard.press("KeyP")
+            fingers, pedals = page.context.new_cdp_session(page), page.locator("#pedals").bounding_box()
+            assert pedals is not None
+            throttle = {"x": pedals["x"] + pedals["width"] / 2, "y": pedals["y"] + 1}
             end = time.monotonic() + 60 * minutes
             rng = random.Random(0)
             page.evaluate(WATCH)
@@ -186,14 +193,16 @@ def measure_browser(env: str, minutes: float) -> None:
                 time.sleep(rng.uniform(0.3, 0.4))
                 page.keyboard.up("ArrowUp")
                 time.sleep(rng.uniform(0.6, 0.7))  # it is back in the middle
+                page.keyboard.press("Space")
+                time.sleep(rng.uniform(0.3, 0.4))
+                fingers.send("Input.dispatchTouchEvent", {"type": "touchStart", "touchPoints": [throttle]})
+                time.sleep(rng.uniform(0.3, 0.4))
+                fingers.send("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
+                time.sleep(rng.uniform(1.2, 1.3))  # handed back
             rows.extend({"kind": kind, "ms": value} for kind, values in page.evaluate("seen").items() for value in values)
             facts = {"load": round(os.getloadavg()[1], 2), "cores": os.cpu_count()}
             versions = {"versions": f"{VERSIONS} chromium={browser.version}"}
             rows[:] = [row | {"ms": round(row["ms"], 2)} | facts | versions for row in rows]
-            page.keyboard.press("Space")
-            page.keyboard.down("ArrowLeft")
-            time.sleep(0.5)
-            page.screenshot(path=PICTURES / "browser.png")
             browser.close()
 
     async def all_of_it() -> None:
@@ -273,8 +282,10 @@ def report() -> None:
 def report_browser() -> None:
     rows = list(csv.DictReader((RESULTS / "browser.csv").open()))
     print(f"Chromium on loopback, load average {rows[0]['load']}")
-    for kind in ("round trip", "shown", "applied"):
+    for kind in ("round trip", "shown", "applied", "touch shown", "touch applied"):
         times = np.array([float(row["ms"]) for row in rows if row["kind"] == kind])
+        if len(times) == 0:
+            continue
         p50, p99 = np.percentile(times, (50, 99))
         print(f"  {kind} [ms]: median {p50:.1f}, p99 {p99:.1f}, most {times.max():.1f}, of {len(times)}")
 
@@ -285,7 +296,9 @@ def pictures() -> None:
         agent = Path(__file__).parent / "agents" / f"{algo}-SafeDrive-v0.zip"
         with tempfile.TemporaryDirectory() as folder:
             window = Window("picture")
-            run = make_run("SafeDrive-v0", folder, Keyboard(), "--algo", algo, "--trained-agent", str(agent))
+            run = make_run(
+                "SafeDrive-v0", folder, Keyboard(), "--algo", algo, "--trained-agent", str(agent), *OLD.get(algo, ())
+            )
 
             def is_over(run: DriveRun = run, window: Window = window, keys: list[int] = keys, name: str = name) -> bool:
                 display = run.drive.display
@@ -305,6 +318,68 @@ def pictures() -> None:
             window.close()
             if run.error is not None:
                 raise run.error
+    if chromium() is not None:
+        pictures_of_the_page()
+
+
+def chromium() -> str | None:
+    """
+    :return: path of the browser
+    """
+    return next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+
+
+def pictures_of_the_page() -> None:
+    """A trained agent drives, the person takes over: on a screen with a key, on a phone with a thumb."""
+    from sb3_chac.cockpit.server import Server
+
+    device = Browser()
+
+    def take_pictures() -> None:
+        from playwright.sync_api import sync_playwright
+
+        with sync_playwright() as playwright:
+            browser = playwright.chromium.launch(executable_path=chromium(), args=["--no-sandbox"])
+            for name, width, height, touch in (("browser", 1280, 800, False), ("phone", 844, 390, True)):
+                page = browser.new_page(viewport={"width": width, "height": height}, has_touch=touch)
+                page.goto(server.address.url(server.driver_token))
+                page.wait_for_selector("text=You are at the wheel")
+                page.keyboard.press("KeyP")
+                begun = run.drive.display.number
+                while run.drive.display.number < begun + 60:
+                    time.sleep(0.05)
+                if touch:
+                    pad = page.locator("#pedals").bounding_box()
+                    assert pad is not None
+                    place = {"x": pad["x"] + pad["width"] / 2, "y": pad["y"] + 0.8 * pad["height"]}
+                    thumb = page.context.new_cdp_session(page)
+                    thumb.send("Input.dispatchTouchEvent", {"type": "touchStart", "touchPoints": [place]})
+                else:
+                    page.keyboard.down("ArrowDown")
+                page.wait_for_selector("text=YOU DRIVE")
+                page.screenshot(path=PICTURES / f"{name}.png")
+                page.keyboard.press("Space")
+                page.keyboard.press("KeyP")
+                page.close()
+            browser.close()
+
+    async def all_of_it() -> None:
+        async with server.listening():
+            run.thread.start()
+            try:
+                await asyncio.to_thread(take_pictures)
+            finally:
+                run.drive.quit()
+            while not run.is_over:
+                await asyncio.sleep(0.1)
+
+    with tempfile.TemporaryDirectory() as folder:
+        agent = Path(__file__).parent / "agents" / "dpvp-SafeDrive-v0.zip"
+        run = make_run("SafeDrive-v0", folder, device, "--algo", "dpvp", "--trained-agent", str(agent))
+        server = Server(run.drive, device, Address("127.0.0.1", 0))
+        asyncio.run(all_of_it())
+        if run.error is not None:
+            raise run.error
 
 
 if __name__ == "__main__":

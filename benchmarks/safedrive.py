@@ -27,8 +27,8 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback, EveryNTimesteps
 
 import sb3_chac.envs  # noqa: F401
+from sb3_chac.envs.driving.geometry import boxes_overlap
 from sb3_chac.envs.safedrive.driver import ScriptedDriver
-from sb3_chac.envs.safedrive.geometry import boxes_overlap
 from sb3_chac.envs.safedrive.navigation import N_STATE, route_ahead
 from sb3_chac.envs.safedrive.traffic import CAR_LENGTH, CAR_WIDTH
 from sb3_chac.evaluation.evaluation import evaluate
@@ -64,6 +64,7 @@ class BlindFollower:
         self.lane = self.env.lateral
 
     def __call__(self, observation):
+        self.driver._locate()
         error = self.driver._speed_cap() - self.env.ego.speed
         return np.clip([self.driver._steering(self.lane, 0.28), error], -1, 1)
 

@@ -1,4 +1,5 @@
-"""``python -m sb3_chac train ...`` (or ``sb3-chac train ...``): RL-Zoo3's commands with our algorithms registered, and ours.
+"""
+``python -m sb3_chac train ...`` (or ``sb3-chac train ...``): RL-Zoo3's commands with our algorithms registered, and ours.
 
 RL-Zoo3's are for places where the stock ``rl_zoo3`` command does not find them (no .pth files, ``SB3_CHAC_NO_AUTOLOAD`` set).
 """
@@ -9,7 +10,7 @@ from importlib import import_module
 # Name -> module
 OWN_COMMANDS = {
     **{name: f"sb3_chac.{name}" for name in ("drive", "evaluate", "resume", "plot", "compare", "demos")},
-    **{name: f"sb3_chac.deploy.{name}" for name in ("export",)},
+    **{name: f"sb3_chac.deploy.{name}" for name in ("export", "run")},
 }
 COMMANDS = ("train", "enjoy", "plot_train", "plot_from_file", "all_plots", *OWN_COMMANDS)
 
@@ -22,7 +23,8 @@ RL-Zoo3's commands with the algorithms of sb3_chac, and
   plot RUN_FOLDER       its curves: return, success rate, safety cost, what the human drove
   compare RUN RUN ...   several runs in one figure and table, with intervals over seeds
   demos COMMAND         demonstrations: record them, look at them, drive them again
-  export MODEL.zip FILE.onnx  a model as one ONNX file, for a vehicle
+  export MODEL.zip POLICY.onnx  a model as one ONNX file, for a vehicle
+  run POLICY.onnx       that file at the end of a network link: observations in, checked actions out; without torch
 With --gym-packages MODULE [MODULE ...], each imports these first: they register environments of yours.
 'sb3-chac train --help' lists the arguments, so does --help of the others.
 Models, replay buffers, run folders and hyperparameters files are code (docs/loading.md): open those that you trust only."""
@@ -62,6 +64,7 @@ def import_packages(command: str, arguments: list[str]) -> list[str]:
 
 
 def main() -> None:
+    """Run the command that the command line names."""
     command = sys.argv[1] if len(sys.argv) > 1 else "nothing"
     if command in ("-h", "--help"):
         print(USAGE)

@@ -1,4 +1,5 @@
-"""Make RL-Zoo3 know our algorithms and gymnasium our environments, without being asked.
+"""
+Make RL-Zoo3 know our algorithms and gymnasium our environments, without being asked.
 
 Python runs ``install`` at every start (through ``sb3_chac.pth``, or ``sb3_chac.start`` from Python 3.15 on, PEP 829):
 RL-Zoo3 has no plug-in point, and its ``--algo`` accepts only what is registered before its arguments are read.

@@ -4,8 +4,8 @@ import argparse
 import re
 from pathlib import Path
 
-from sb3_chac.evaluate import check_output
 from sb3_chac.evaluation import curves
+from sb3_chac.evaluation.arguments import check_output
 from sb3_chac.evaluation.curves import Method
 from sb3_chac.evaluation.episodes import NotEvaluable
 from sb3_chac.evaluation.pictures import PLOT_SUFFIXES
@@ -32,6 +32,7 @@ QUANTITIES = (curves.RETURN, curves.SUCCESS, curves.TRAINING_COST, curves.HUMAN_
 
 
 def make_parser() -> argparse.ArgumentParser:
+    """Make the parser of the command line."""
     parser = argparse.ArgumentParser(
         "sb3-chac compare", description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -51,6 +52,8 @@ def make_parser() -> argparse.ArgumentParser:
 
 def main(arguments: list[str]) -> None:
     """
+    Run the command.
+
     :param arguments: of the command line, after ``compare``
     """
     parser = make_parser()
@@ -69,6 +72,8 @@ def main(arguments: list[str]) -> None:
 
 def read(runs: list[str]) -> list[Method]:
     """
+    Read the runs of the command line.
+
     :param runs: see ``DESCRIPTION``
     :return: in the order in which their labels come first
     :raises FileNotFoundError: if a folder does not exist
@@ -95,6 +100,8 @@ def read(runs: list[str]) -> list[Method]:
 
 def parse(run: str) -> tuple[str, list[Path]]:
     """
+    Parse a run of the command line.
+
     :param run: [LABEL=]FOLDER[+FOLDER ...]; a folder of this name goes first, whatever is in its name
     :return: label and folders
     """
@@ -108,6 +115,8 @@ def parse(run: str) -> tuple[str, list[Path]]:
 
 def with_human(methods: list[Method]) -> list[Method]:
     """
+    Select the methods that a human helped.
+
     :return: the methods that a human helped
     :raises NotPlottable: if there is none
     """
@@ -122,6 +131,8 @@ def with_human(methods: list[Method]) -> list[Method]:
 
 def write(methods: list[Method], args: argparse.Namespace) -> None:
     """
+    Write the pictures and tables.
+
     :param args: see ``make_parser``
     """
     figure = curves.draw(methods, QUANTITIES, over_human=args.x == "human")

@@ -19,8 +19,10 @@ from sb3_chac.common.demonstrations import DatasetError, load_demonstrations, op
 from sb3_chac.datasets.recording import WatchedEnv, record
 from sb3_chac.datasets.replay import Replay
 from sb3_chac.datasets.writer import SETTINGS
-from sb3_chac.evaluate import check_output, parse_env_kwargs
+from sb3_chac.deploy.dataset import dataset_of
+from sb3_chac.deploy.metadata import NotDeployable
 from sb3_chac.evaluation import pictures
+from sb3_chac.evaluation.arguments import check_output, parse_env_kwargs
 from sb3_chac.evaluation.episodes import NotEvaluable, make_env
 from sb3_chac.evaluation.evaluation import saved_model
 from sb3_chac.evaluation.models import DEFAULT_ENV, find_algorithm, find_normalization, load_model
@@ -37,15 +39,19 @@ RECORD = """Record whole episodes until there are at least --steps steps. With -
 watches it, takes over by --rule and hands back. The dataset does not depend on --jobs; nothing is left of one that is
 interrupted. Models are code (docs/loading.md): open those that you trust only."""
 
+FROM_LOG = """Write what a vehicle reported to 'sb3-chac run' as a dataset: observations, executed actions, who drove, what the
+policy proposed, cost. A reward that it did not report is 0; where packets were lost, episodes are cut."""
+
 REPLAY = """Make the environment again, reset it with the recorded seed and scenario, and repeat the actions of one episode. It
 tells how far that led elsewhere than when it was recorded. The environment must be registered: a dataset runs no code."""
 
 
 def make_parser() -> argparse.ArgumentParser:
+    """Make the parser of the command line."""
     parser = argparse.ArgumentParser(
         "sb3-chac demos", description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    commands = parser.add_subparsers(dest="command", required=True, metavar="{record,info,replay}")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="{record,info,replay,from-log}")
     new = commands.add_parser("record", help="record a dataset", description=RECORD)
     new.add_argument("--dataset", required=True, metavar="ID", help="such as safedrive/scripted-v0, or a folder")
     new.add_argument("--overwrite", action="store_true", help="replace a dataset of that name")
@@ -80,6 +86,12 @@ def make_parser() -> argparse.ArgumentParser:
     replay = commands.add_parser("replay", help="drive an episode again", description=REPLAY)
     for command in (info, replay):
         command.add_argument("--dataset", required=True, metavar="ID", help="of Minari, or a folder")
+    from_log = commands.add_parser("from-log", help="a log of 'sb3-chac run' as a dataset", description=FROM_LOG)
+    from_log.add_argument("log", type=Path, metavar="LOG.jsonl", help="that 'sb3-chac run --log' wrote")
+    from_log.add_argument("--dataset", required=True, metavar="ID", help="such as drives/monday-v0, or a folder")
+    from_log.add_argument("--overwrite", action="store_true", help="replace a dataset of that name")
+    from_log.add_argument("--env", default=DEFAULT_ENV, metavar="ID", help="with the vehicle's spaces (default: %(default)s)")
+    from_log.add_argument("--env-kwargs", nargs="+", default=[], metavar="KEY:VALUE", help="passed to it, Python literals")
     replay.add_argument("--episode", type=int, default=0, metavar="K", help="number, from 0 (default: %(default)s)")
     replay.add_argument("--video", type=Path, metavar="FILE", help=".mp4 or .gif of it")
     return parser
@@ -87,6 +99,8 @@ def make_parser() -> argparse.ArgumentParser:
 
 def main(arguments: list[str]) -> None:
     """
+    Run the command.
+
     :param arguments: of the command line, after ``demos``
     """
     parser = make_parser()
@@ -94,13 +108,26 @@ def main(arguments: list[str]) -> None:
     th.set_num_threads(1)
     before = signal.signal(signal.SIGTERM, _stop)  # so that it cleans up as after Ctrl-C
     try:
-        {"record": run_record, "info": run_info, "replay": run_replay}[args.command](args)
-    except (NotEvaluable, DatasetError, OSError) as error:
+        {"record": run_record, "info": run_info, "replay": run_replay, "from-log": run_from_log}[args.command](args)
+    except (NotEvaluable, DatasetError, NotDeployable, OSError) as error:
         parser.exit(2, f"{parser.prog} {args.command}: error: {error}\n")
     except KeyboardInterrupt:
         parser.exit(130, f"{parser.prog} {args.command}: interrupted\n")
     finally:
         signal.signal(signal.SIGTERM, before)
+
+
+def run_from_log(args: argparse.Namespace) -> None:
+    """
+    :param args: see ``make_parser``
+    :raises ValueError: if the log does not fit (``NotDeployable``, ``DatasetError``, ``NotEvaluable``)
+    """
+    env = make_env(args.env, parse_env_kwargs(args.env_kwargs))
+    try:
+        folder, episodes, steps = dataset_of(args.log, args.dataset, env, args.overwrite)
+    finally:
+        env.close()
+    print(f"Saved {folder}: {episodes} episodes, {steps} steps")
 
 
 def _stop(signal_number: int, frame: FrameType | None) -> None:
@@ -109,6 +136,8 @@ def _stop(signal_number: int, frame: FrameType | None) -> None:
 
 def run_record(args: argparse.Namespace) -> None:
     """
+    Record a dataset.
+
     :param args: see ``make_parser``
     :raises DatasetError: for a name that is taken, or spaces that a dataset cannot hold
     :raises FileNotFoundError: if a model does not exist
@@ -149,6 +178,8 @@ def run_record(args: argparse.Namespace) -> None:
 
 def find_model(path: Path, env_id: str, env_kwargs: dict[str, Any]) -> tuple[BaseAlgorithm, VecNormalize | None]:
     """
+    Load a model with the statistics of its observations.
+
     :return: the model, and the statistics that its observations are normalized with, if any
     """
     path, algo, algorithm = find_algorithm(path, None)
@@ -161,6 +192,8 @@ def find_model(path: Path, env_id: str, env_kwargs: dict[str, Any]) -> tuple[Bas
 
 def run_info(args: argparse.Namespace) -> None:
     """
+    Print what is in a dataset.
+
     :raises DatasetError: for a dataset that is missing, damaged or empty
     """
     print(describe(args.dataset))
@@ -168,6 +201,8 @@ def run_info(args: argparse.Namespace) -> None:
 
 def describe(dataset: str | os.PathLike[str]) -> str:
     """
+    Describe a dataset.
+
     :return: what there is to know about a dataset, to read
     :raises DatasetError: for one that is missing, damaged or empty
     """
@@ -205,6 +240,8 @@ def describe(dataset: str | os.PathLike[str]) -> str:
 
 def as_range(scenarios: list[int] | None) -> str:
     """
+    Word a list of scenarios.
+
     :return: "100:120" for 100 to 119 in their order, else the numbers themselves
     """
     if scenarios is None:
@@ -215,6 +252,8 @@ def as_range(scenarios: list[int] | None) -> str:
 
 def shortened(space: spaces.Space) -> str:
     """
+    Word a space in a few characters.
+
     :return: what to call it, without a number for each of its bounds
     """
     if not isinstance(space, spaces.Box):
@@ -224,6 +263,8 @@ def shortened(space: spaces.Space) -> str:
 
 def run_replay(args: argparse.Namespace) -> None:
     """
+    Drive an episode again.
+
     :raises DatasetError: for a dataset, or an episode of it, that is missing or cannot be driven again
     :raises NotEvaluable: if its environment cannot be made, or cannot render
     """

@@ -26,7 +26,7 @@ from sb3_chac.cockpit.devices import (
 )
 from sb3_chac.cockpit.person import NotDrivable
 from sb3_chac.common.demonstrations import DatasetError
-from sb3_chac.evaluate import parse_env_kwargs
+from sb3_chac.evaluation.arguments import parse_env_kwargs
 from sb3_chac.evaluation.episodes import NotEvaluable
 from sb3_chac.evaluation.models import DEFAULT_ENV
 
@@ -46,6 +46,7 @@ SAVE_FREQ = 600  # steps: a minute
 
 
 def make_parser() -> argparse.ArgumentParser:
+    """Make the parser of the command line."""
     parser = argparse.ArgumentParser(
         "sb3-chac drive", description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -72,6 +73,9 @@ def make_parser() -> argparse.ArgumentParser:
     how.add_argument(
         "--steering", default="auto", choices=("auto", "left", "right"), help="side of the greatest first action (%(default)s)"
     )
+    how.add_argument(
+        "--query", type=float, metavar="RISK", help="the novice asks for help from this risk on, for example 0.95"
+    )
     how.add_argument("--go", action="store_true", help="begin at once, do not wait for P")
     where = parser.add_argument_group("what is written")
     where.add_argument("-f", "--log-folder", default="logs", help="(default: %(default)s)")
@@ -93,6 +97,8 @@ def make_parser() -> argparse.ArgumentParser:
 
 def main(arguments: list[str]) -> None:
     """
+    Run the command.
+
     :param arguments: of the command line, after ``drive``
     """
     parser = make_parser()
@@ -113,6 +119,8 @@ def main(arguments: list[str]) -> None:
 
 def recover(run_folder: Path) -> None:
     """
+    Make the dataset of a drive that was killed.
+
     :param run_folder: of a drive that was killed
     :raises NotDrivable: if it left nothing behind
     """
@@ -126,6 +134,8 @@ def recover(run_folder: Path) -> None:
 
 def run(args: argparse.Namespace, arguments: list[str]) -> None:
     """
+    Begin or resume a drive.
+
     :param args: see ``make_parser``
     :param arguments: that they come from
     """
@@ -154,6 +164,8 @@ def run(args: argparse.Namespace, arguments: list[str]) -> None:
 
 def without(option: str, arguments: list[str]) -> list[str]:
     """
+    Drop an option from a command line.
+
     :param option: that has a value
     :return: the arguments without it
     """
@@ -163,6 +175,18 @@ def without(option: str, arguments: list[str]) -> list[str]:
             kept.append(argument)
         skip = argument == option
     return kept
+
+
+def check_numbers(args: argparse.Namespace) -> None:
+    """
+    Check numbers for which nothing is filled in.
+
+    :raises NotDrivable: for numbers out of their range
+    """
+    if args.rate is not None and not 0.5 <= args.rate <= 100:
+        raise NotDrivable(f"--rate must be from 0.5 to 100 steps per second, got {args.rate:g}.")
+    if args.query is not None and not 0 < args.query <= 1:
+        raise NotDrivable(f"--query must be above 0 and at most 1 (for example 0.95), got {args.query:g}.")
 
 
 def check_arguments(args: argparse.Namespace) -> None:
@@ -191,8 +215,7 @@ def check_arguments(args: argparse.Namespace) -> None:
         raise NotDrivable(f"--trained-agent: there is no file {args.trained_agent}.")
     if args.pretrain and not args.demos:
         raise NotDrivable("--pretrain needs --demos: there is nothing to learn from before the drive.")
-    if args.rate is not None and not 0.5 <= args.rate <= 100:
-        raise NotDrivable(f"--rate must be from 0.5 to 100 steps per second, got {args.rate:g}.")
+    check_numbers(args)
     if args.serve and (args.device != "auto" or args.config):
         raise NotDrivable("--serve is driven with the browser's devices: leave out --device and --config.")
     if (args.tls_cert or args.tls_key) and not (args.serve and args.tls_cert):
@@ -214,6 +237,8 @@ def check_arguments(args: argparse.Namespace) -> None:
 
 def drive(args: argparse.Namespace) -> None:
     """
+    Drive, in a window or in a browser.
+
     :param args: see ``make_parser``, checked
     """
     from sb3_chac.cockpit.run import DriveRun
@@ -240,6 +265,8 @@ def drive(args: argparse.Namespace) -> None:
 
 def begin(drive_run: Any) -> None:
     """
+    Start the driving thread.
+
     :param drive_run: is begun; unless it is to go at once, it waits for the person
     """
     drive_run.thread.start()
@@ -249,6 +276,8 @@ def begin(drive_run: Any) -> None:
 
 def in_browser(args: argparse.Namespace) -> Any:
     """
+    Serve the page until the drive is over.
+
     :param args: see ``make_parser``, checked
     :return: the run, when it is over
     """
@@ -266,6 +295,8 @@ def in_browser(args: argparse.Namespace) -> Any:
 
 def wait_for_end(window: Any, drive_run: Any) -> None:
     """
+    Show the window until the drive is over.
+
     :param window: of the cockpit
     :param drive_run: that it shows. Ctrl-C ends it as Q does
     """
@@ -280,6 +311,8 @@ def wait_for_end(window: Any, drive_run: Any) -> None:
 
 def find_device(args: argparse.Namespace) -> Device:
     """
+    Choose the device of the command line.
+
     :param args: see ``make_parser``
     :raises DeviceError: for a configuration that cannot be used
     """
@@ -298,6 +331,8 @@ def find_device(args: argparse.Namespace) -> Device:
 
 def calibrate(file: Path) -> None:
     """
+    Ask for the axes and buttons of a device and save them.
+
     :param file: YAML, is written
     :raises DeviceError: if there is no device, or no sense in what it says
     """

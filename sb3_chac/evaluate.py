@@ -1,17 +1,16 @@
 """``python -m sb3_chac evaluate``: a trained model, or an expert, on held-out scenarios."""
 
 import argparse
-import ast
 import csv
 import os
 from pathlib import Path
-from typing import Any
 
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_chac.chac.policies import CONTROLS
 from sb3_chac.evaluation import pictures
+from sb3_chac.evaluation.arguments import check_output, parse_env_kwargs
 from sb3_chac.evaluation.episodes import NotEvaluable, Runner, Task, make_env
 from sb3_chac.evaluation.evaluation import Evaluation, compare, evaluate, scenario_list
 from sb3_chac.evaluation.models import DEFAULT_ENV, env_of, find_algorithm, find_normalization, load_model
@@ -32,6 +31,7 @@ A model and its vecnormalize.pkl are code (docs/loading.md): load those that you
 
 
 def make_parser() -> argparse.ArgumentParser:
+    """Make the parser of the command line."""
     parser = argparse.ArgumentParser(
         "sb3-chac evaluate", description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -79,6 +79,8 @@ def make_parser() -> argparse.ArgumentParser:
 
 def main(arguments: list[str]) -> None:
     """
+    Run the command.
+
     :param arguments: of the command line, after ``evaluate``
     """
     parser = make_parser()
@@ -97,6 +99,8 @@ def main(arguments: list[str]) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """
+    Evaluate as the command line says.
+
     :param args: see ``make_parser``
     :raises FileNotFoundError: if the model, or the folder of an output file, does not exist
     :raises NotEvaluable: for whatever else does not fit, found before the episodes run
@@ -165,6 +169,8 @@ def run(args: argparse.Namespace) -> None:
 
 def write_files(args: argparse.Namespace, evaluation: Evaluation, task: Task, filmed: int) -> None:
     """
+    Write the files of an evaluation.
+
     :param args: which files
     :param evaluation: what goes into them
     :param task: what was evaluated
@@ -186,6 +192,8 @@ def write_files(args: argparse.Namespace, evaluation: Evaluation, task: Task, fi
 
 def write_steps(file: Path, evaluation: Evaluation) -> None:
     """
+    Write the steps of all episodes.
+
     :param file: CSV, gets a row for each step: scenario (or episode), step, x and y [m] before it, the action, and cost: 1 if
         any arose in it
     :param evaluation: made with ``record_paths=True``
@@ -200,42 +208,3 @@ def write_steps(file: Path, evaluation: Evaluation) -> None:
             for step, (position, action, costly) in enumerate(zip(path.positions, actions, path.costly[1:], strict=False)):
                 number = record.get("scenario", record.get("episode"))
                 writer.writerow([number, step, *position.round(3), *action.round(4), int(costly)])
-
-
-def check_output(option: str, path: Path | None, suffixes: tuple[str, ...] = ()) -> None:
-    """
-    :param option: for the message
-    :param path: file that is to be written at the end, None if none
-    :param suffixes: those possible, all if empty
-    :raises FileNotFoundError: if its folder does not exist
-    :raises NotEvaluable: if it cannot be written, or has another suffix
-    """
-    if path is None:
-        return
-    if suffixes and path.suffix not in suffixes:
-        raise NotEvaluable(f"{option} {path}: the file name must end with {' or '.join(suffixes)}.")
-    if not path.parent.is_dir():
-        raise FileNotFoundError(f"{option} {path}: the folder {path.parent} does not exist, create it first.")
-    existed = path.exists()
-    try:
-        path.open("ab").close()
-    except OSError as error:
-        raise NotEvaluable(f"{option} {path}: cannot be written ({error.strerror}).") from error
-    if not existed:
-        path.unlink()
-
-
-def parse_env_kwargs(pairs: list[str]) -> dict[str, Any]:
-    """
-    :param pairs: such as "density:0.1"
-    :raises NotEvaluable: unless each has a key and a Python literal
-    """
-    result = {}
-    for pair in pairs:
-        key, _, value = pair.partition(":")
-        try:
-            result[key] = ast.literal_eval(value)
-        except (ValueError, SyntaxError) as error:
-            hint = "must look like key:value with a Python literal, e.g. density:0.1 or name:\"'text'\""
-            raise NotEvaluable(f"--env-kwargs {hint}, got {pair!r}.") from error
-    return result

@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from sb3_chac.common.callbacks import PROGRESS_FILE
-from sb3_chac.evaluate import check_output
+from sb3_chac.evaluation.arguments import check_output
 from sb3_chac.evaluation.episodes import NotEvaluable
 from sb3_chac.evaluation.pictures import PLOT_SUFFIXES
 
@@ -34,6 +34,8 @@ class NotPlottable(NotEvaluable):
 
 
 class Panel(NamedTuple):
+    """How a curve is drawn."""
+
     title: str
     subtitle: str
     colour: str
@@ -56,6 +58,8 @@ Curves = dict[str, np.ndarray]
 
 def main(arguments: list[str]) -> None:
     """
+    Run the command.
+
     :param arguments: of the command line, after ``plot``
     """
     parser = argparse.ArgumentParser(
@@ -84,6 +88,8 @@ def main(arguments: list[str]) -> None:
 
 def join(run_folders: list[Path]) -> Curves:
     """
+    Join the curves of runs that resumed each other.
+
     :param run_folders: each but the first goes on from some step of the one before; what that did afterwards is left out
     :raises FileNotFoundError: if one does not exist
     :raises NotPlottable: if there is nothing in it, or it does not go on from the one before
@@ -104,6 +110,8 @@ def join(run_folders: list[Path]) -> Curves:
 
 def read_run(folder: Path) -> Curves:
     """
+    Read the curves of a run.
+
     :raises FileNotFoundError: if it does not exist
     :raises NotPlottable: if there is no curve in it
     """
@@ -130,6 +138,8 @@ def read_run(folder: Path) -> Curves:
 
 def read_evaluations(file: Path) -> Curves:
     """
+    Read the curves of the evaluations.
+
     :param file: as SB3's EvalCallback writes it
     """
     with np.load(file) as data:
@@ -142,6 +152,8 @@ def read_evaluations(file: Path) -> Curves:
 
 def read_progress(file: Path) -> Curves:
     """
+    Read the curves of the training.
+
     :param file: as ``CSVProgress`` writes it
     """
     with file.open(newline="") as lines:
@@ -156,6 +168,8 @@ def read_progress(file: Path) -> Curves:
 
 def draw(curves: Curves) -> Figure:
     """
+    Draw all curves.
+
     :param curves: at least one of those in ``PANELS``
     """
     names = [name for name in PANELS if name in curves]
@@ -178,6 +192,8 @@ def draw(curves: Curves) -> Figure:
 
 def draw_panel(axes: Axes, panel: Panel, curve: np.ndarray) -> None:
     """
+    Draw one curve.
+
     :param curve: of shape (n, 3): step, value, standard deviation
     """
     steps, values, spread = curve.T

@@ -26,6 +26,8 @@ A run folder is code: models, replay buffers and command lines in it can run any
 
 def main(arguments: list[str]) -> None:
     """
+    Run the command.
+
     :param arguments: of the command line, after ``resume``
     """
     parser = argparse.ArgumentParser(

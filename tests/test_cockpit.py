@@ -383,6 +383,7 @@ def test_stage_2_is_prepared_beside_the_drive_and_the_person_may_still_take_over
     assert model._n_updates == 80 - model.learning_starts
     assert 10 < model.counts["human_steps"] < 50  # none before the switch, until the episode ended
     assert drive.novice.stage == "2: self-learning" and 0 <= drive.novice.confidence <= 1
+    assert 0 <= drive.novice.risk <= 1
     env.recorder.finish()
 
 
@@ -519,6 +520,7 @@ def main_with(monkeypatch, *arguments):
         (["--env", "Pendulum-v1"], "two bounded actions"),
         (["--pretrain", "5"], "--pretrain needs --demos"),
         (["--rate", "0"], "--rate must be from"),
+        (["--query", "1.5"], "--query must be above 0"),
         (["--config", "nothing.yml"], "nothing.yml cannot be read"),
         (["--resume", "nowhere"], "there is no such folder"),
         (["--recover", "nowhere"], "holds no recording"),

@@ -496,6 +496,20 @@ def command(folder, *arguments):
         process.wait()
 
 
+async def driven_until(channel, wanted):
+    """Goes on whenever it is paused: on a busy machine the driver falls silent for longer than a device may."""
+    patience = 0  # states until the wish is repeated
+    while True:
+        state = await state_of(channel, lambda state: "role" in state)
+        state["total steps"] = int(dict(state["indicators"])["total step"])
+        if wanted(state):
+            return
+        patience = max(patience - 1, 0) if state["paused"] else 0
+        if state["paused"] and not patience:
+            await channel.send_json({"wish": "pause"})
+            patience = 40
+
+
 def test_drive_in_a_browser_and_sigterm_saves(tmp_path):
     async def play(url):
         page, token = re.fullmatch(r"(.*)/\?token=(.*)", url).groups()
@@ -503,11 +517,9 @@ def test_drive_in_a_browser_and_sigterm_saves(tmp_path):
             async with session.ws_connect(f"{page}/ws?token={token}", headers={"Origin": page}) as channel:
                 driver = Driver(channel)
                 task = asyncio.create_task(driver.tell())
-                await state_of(channel, lambda state: "role" in state)
-                await channel.send_json({"wish": "pause"})
-                await state_of(channel, lambda state: "role" in state and state["indicators"][2] != ["total step", "0"])
+                await driven_until(channel, lambda state: state["total steps"] > 0)
                 driver.keys = ["up"]
-                await state_of(channel, lambda state: "role" in state and state["applied"] == [0, 1])
+                await driven_until(channel, lambda state: state["applied"] == [0, 1])
                 process.send_signal(signal.SIGTERM)
                 await closed(channel)
                 task.cancel()
@@ -518,7 +530,7 @@ def test_drive_in_a_browser_and_sigterm_saves(tmp_path):
         asyncio.run(play(url))
         printed = process.stdout.read()
         assert process.wait(FOREVER) == 0
-    assert "in 1 takeovers" in printed and "sb3-chac drive --resume logs/pvp/SafeDrive-v0_1" in printed
+    assert re.search("in [1-9][0-9]* takeovers", printed) and "sb3-chac drive --resume logs/pvp/SafeDrive-v0_1" in printed
     assert list((tmp_path / "logs/pvp/SafeDrive-v0_1/checkpoints").glob("*/replay_buffer.pkl"))
 
 

@@ -15,10 +15,10 @@ from sb3_chac.envs.driving.corridors import (
     STRIPS_BEGIN,
     Corridors,
 )
+from sb3_chac.envs.driving.geometry import wrap_angle
 from sb3_chac.envs.safedrive import SafeDriveEnv
 from sb3_chac.envs.safedrive import traffic as t
 from sb3_chac.envs.safedrive.driver import ScriptedDriver
-from sb3_chac.envs.safedrive.geometry import wrap_angle
 from sb3_chac.envs.safedrive.navigation import CHECKPOINTS, N_EGO, N_STATE, route_ahead
 
 

@@ -313,11 +313,11 @@ def test_ppo_lag_moves_it_by_the_mean_of_the_rollout_before_the_policy():
 def test_the_cost_of_an_episode_that_is_broken_off_is_forgotten(algorithm):
     model = make_model(algorithm, Bill([1.0] * 100, length=100))
     model.learn(64)
-    assert model.episode_costs == [64]
+    assert model.episode_costs.sums == [64]
     model.learn(32, reset_num_timesteps=False)  # goes on in the same episode
-    assert model.episode_costs == [96]
+    assert model.episode_costs.sums == [96]
     model.learn(32)
-    assert model.episode_costs == [32] and model.safety_cost == 128 and not model.ep_cost_buffer
+    assert model.episode_costs.sums == [32] and model.safety_cost == 128 and not model.ep_cost_buffer
 
 
 # ---- As SB3's users expect ----

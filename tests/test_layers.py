@@ -1,6 +1,7 @@
 """Layers of the package, read from the source: what may import what, and that every import of ours exists."""
 
 import ast
+import configparser
 import importlib.util
 from collections.abc import Iterator
 from pathlib import Path
@@ -8,24 +9,26 @@ from typing import NamedTuple
 
 import pytest
 
+import sb3_chac
+
 ROOT = Path(__file__).parents[1]
 PACKAGE = "sb3_chac"
 # Lowest first. A part of the package imports from lower layers only, not even from others of its own layer, except:
 LAYERS = (
     {"common"},
     {"human", "envs"},
-    {"dsac", "pvp", "dpvp", "chac", "sac_lag", "ppo_lag", "bc", "cql", "gail", "hg_dagger", "iwr"},
+    set(sb3_chac.ALGORITHMS),
     {"__init__"},  # the public names, imported on first use, and the version
     {"zoo"},
     {"evaluation"},
     {"datasets"},
     {"deploy"},
     {"cockpit"},
-    {"cli", "evaluate", "drive", "resume", "plot", "compare", "demos"},
+    {"evaluate", "drive", "resume", "plot", "demos"},
+    {"compare"},  # reads runs as plot does
     {"__main__", "_startup"},
 )
 PARENTS = {"dpvp": {"dsac"}, "chac": {"dpvp"}, "hg_dagger": {"bc"}, "iwr": {"hg_dagger", "bc"}}  # an algorithm derives from it
-HELPERS = {("drive", "evaluate"), ("demos", "evaluate"), ("plot", "evaluate"), ("compare", "evaluate"), ("compare", "plot")}
 
 
 class Import(NamedTuple):
@@ -77,9 +80,9 @@ def is_upward(found: Import) -> bool:
     :return: whether an import breaks the order of the layers
     """
     level = {part: number for number, layer in enumerate(LAYERS) for part in layer}
-    if found.part == found.imported or (found.part, found.imported) in HELPERS:
+    if found.part == found.imported or found.imported in PARENTS.get(found.part, ()):
         return False
-    if found.imported in PARENTS.get(found.part, ()) or found.part == "__init__":  # the latter only names what it imports late
+    if found.part == "__init__":  # only names what it imports late
         return False
     return level[found.imported] >= level[found.part]
 
@@ -121,3 +124,14 @@ def test_common_stands_alone():
 
 def test_the_package_is_found_where_these_sources_are():
     assert Path(importlib.util.find_spec(PACKAGE).origin).parents[1] == ROOT
+
+
+def test_every_package_is_installed():
+    setup = configparser.ConfigParser()
+    setup.read(ROOT / "setup.cfg")
+    packages = {".".join(file.parent.relative_to(ROOT).parts) for file in (ROOT / PACKAGE).rglob("__init__.py")}
+    assert set(setup["options"]["packages"].split()) == packages | {f"{PACKAGE}.hyperparams"}
+
+
+def test_every_algorithm_has_hyperparameters():
+    assert all((ROOT / "hyperparams" / f"{algorithm}.yml").is_file() for algorithm in sb3_chac.ALGORITHMS)

@@ -118,8 +118,8 @@ def test_presets_reach_the_simulator(preset):
 
 @needs_metadrive
 def test_scenarios_are_drawn_from_their_range_and_can_be_named(env):
-    drawn = {env.reset(seed=seed)[1]["scenario"] for seed in range(30)}
-    assert len(drawn) > 5 and drawn <= set(range(100, 120))
+    drawn = {env.reset(seed=seed)[1]["scenario"] for seed in range(10)}
+    assert len(drawn) > 3 and drawn <= set(range(100, 120))
     assert env.reset(seed=3)[1]["scenario"] == env.reset(seed=3)[1]["scenario"]
     assert env.reset(options={"scenario": 4321})[1]["scenario"] == 4321
     for wrong in (-1, 1.5, 1_000_000, "a"):

@@ -14,8 +14,9 @@ from hypothesis import strategies as st
 from shell import run
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
+from sb3_chac.envs.driving.geometry import boxes_overlap
 from sb3_chac.envs.safedrive import SafeDriveEnv
-from sb3_chac.envs.safedrive.geometry import Pose, Segment, boxes_overlap, chain, sample, turn
+from sb3_chac.envs.safedrive.geometry import Pose, Segment, chain, sample, turn
 from sb3_chac.envs.safedrive.lidar import Lidar
 from sb3_chac.envs.safedrive.map import BLOCKS, Map
 from sb3_chac.envs.safedrive.traffic import CAR_LENGTH, CAR_WIDTH
@@ -154,6 +155,18 @@ def test_reward_adds_up(env):
         speeds, done = speeds + info["speed"], terminated or truncated
     expected = env.s - start + 0.1 * speeds / 15.0 + 10.0 - 5.0 * info["episode_cost"]
     assert rewards.sum() == pytest.approx(expected, abs=1e-6)
+
+
+def test_careful_driver_arrives_at_8_metres_per_second(env):
+    env.reset(options={"scenario": 2000})
+    driver, speeds, done = env.scripted_driver("scripted-careful"), [], False
+    driver.reset(0)
+    while not done:
+        _, _, terminated, truncated, info = env.step(driver())
+        speeds.append(info["speed"])
+        done = terminated or truncated
+    assert info["is_success"]
+    assert max(speeds) < 9 and np.quantile(speeds, 0.9) == pytest.approx(8, abs=0.5)
 
 
 def test_coefficients_weigh_the_reward():

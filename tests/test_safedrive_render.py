@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from shell import FOREVER
 
-from sb3_chac.envs import display
+from sb3_chac.envs.driving import display
+from sb3_chac.envs.driving.geometry import wrap_angle
 from sb3_chac.envs.safedrive import SafeDriveEnv
 from sb3_chac.envs.safedrive import render as rendering
-from sb3_chac.envs.safedrive.geometry import wrap_angle
 from sb3_chac.envs.safedrive.map import HALF_WIDTH, RING, Map
 from sb3_chac.envs.safedrive.roads import KERB, road_network
 

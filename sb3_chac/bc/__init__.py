@@ -1,3 +1,5 @@
+"""Behaviour cloning (BC)."""
+
 from sb3_chac.bc.bc import BC
 from sb3_chac.bc.policies import CnnPolicy, MlpPolicy
 

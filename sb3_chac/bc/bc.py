@@ -1,3 +1,5 @@
+"""Behaviour cloning (BC)."""
+
 from collections import defaultdict
 from typing import Any, ClassVar, TypeVar
 
@@ -121,6 +123,8 @@ class BC(OfflineAlgorithm):
     @th.no_grad()
     def validation_loss(self) -> float | None:
         """
+        Measure the loss on the steps that are held out.
+
         :return: mean loss of the steps that are not learned from, None if there are none
         """
         assert self._sampler is not None, "There is no dataset yet: call set_dataset() first."

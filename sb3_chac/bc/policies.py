@@ -1,3 +1,5 @@
+"""Policies that are fitted to demonstrations, of BC, HG-DAgger and IWR."""
+
 import math
 from typing import Any, ClassVar
 
@@ -81,18 +83,24 @@ class BCPolicy(BasePolicy):
 
     def action_logits(self, observations: PyTorchObs) -> th.Tensor:
         """
+        Compute the logits of discrete actions.
+
         :return: shape (batch_size, n_actions), for Discrete actions
         """
         return self.logits(self._latent(observations))
 
     def action_mean(self, observations: PyTorchObs) -> th.Tensor:
         """
+        Compute the mean of continuous actions.
+
         :return: scaled to [-1, 1], not clipped, shape (batch_size, action_dim), for Box actions
         """
         return self.mu(self._latent(observations))
 
     def action_mean_and_log_std(self, observations: PyTorchObs) -> tuple[th.Tensor, th.Tensor]:
         """
+        Compute mean and logarithmic standard deviation of continuous actions.
+
         :return: scaled to [-1, 1], not clipped, both of shape (batch_size, action_dim), for Box actions if ``stochastic``
         """
         latent = self._latent(observations)
@@ -100,6 +108,8 @@ class BCPolicy(BasePolicy):
 
     def losses(self, observations: PyTorchObs, actions: th.Tensor) -> th.Tensor:
         """
+        Compute the loss of each demonstrated action.
+
         :param actions: demonstrated, scaled to [-1, 1], shape (batch_size, action_dim); if discrete, from 0 on, shape
             (batch_size,)
         :return: "nll" if the policy is stochastic, else "mse", shape (batch_size,)
@@ -149,6 +159,8 @@ class CnnPolicy(BCPolicy):
 
 def squared_errors(means: th.Tensor, actions: th.Tensor) -> th.Tensor:
     """
+    Compute the squared error of each action.
+
     :param means: shape (batch_size, action_dim)
     :param actions: same shape
     :return: mean over the dimensions of (mean - action)^2, shape (batch_size,)
@@ -158,6 +170,8 @@ def squared_errors(means: th.Tensor, actions: th.Tensor) -> th.Tensor:
 
 def gaussian_nll(means: th.Tensor, log_stds: th.Tensor, actions: th.Tensor) -> th.Tensor:
     """
+    Compute the negative log-likelihood of each action under a Gaussian.
+
     :param means: shape (batch_size, action_dim)
     :param log_stds: same shape
     :param actions: same shape

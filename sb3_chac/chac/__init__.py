@@ -1,3 +1,5 @@
+"""Confidence-guided human-AI collaboration (C-HAC)."""
+
 from sb3_chac.chac.chac import CHAC
 from sb3_chac.chac.policies import CnnPolicy, MlpPolicy, MultiInputPolicy
 

@@ -1,3 +1,5 @@
+"""Confidence-guided human-AI collaboration (C-HAC)."""
+
 import warnings
 from collections import deque
 from typing import Any, ClassVar, TypeVar
@@ -358,6 +360,8 @@ class CHAC(DPVP):
 
     def _reward_scale(self) -> float:
         """
+        Return the scale of the rewards.
+
         :return: the unit of the rewards that Z_c learns
         """
         return max(self.reward_square**0.5, 1e-8) if self.normalize_rewards else 1.0
@@ -367,6 +371,8 @@ class CHAC(DPVP):
         self, batch: DualReplayBufferSamples, rewards: th.Tensor, ent_coef: th.Tensor
     ) -> tuple[th.Tensor, th.Tensor]:
         """
+        Compute the return targets under shared control.
+
         :return: y_q and y_z with a' from shared control, both of shape (batch_size,)
         """
         self_actions, log_prob = self.self_actor_target.action_log_prob(batch.next_observations)
@@ -415,6 +421,8 @@ class CHAC(DPVP):
 
     def _mean_log_prob(self) -> float:
         """
+        Estimate the log-likelihood of the guided policy's own actions.
+
         :return: mean of log pi_g over a batch
         """
         with th.no_grad():
@@ -480,7 +488,7 @@ class CHAC(DPVP):
         policy: str | None = None,
     ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
         """
-        As in SB3, and:
+        Predict actions, as in SB3, under shared control.
 
         :param policy: who acts in stage 2: "guided" (pi_g), "self" (pi_r) or "shared"; by default as in training
         :raises ValueError: for another ``policy``

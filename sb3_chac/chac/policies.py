@@ -1,3 +1,5 @@
+"""Policies of C-HAC, with shared control."""
+
 from typing import Any, ClassVar, NamedTuple
 
 import torch as th
@@ -83,6 +85,8 @@ class CHACPolicy(DPVPPolicy):
 
     def choose(self, observation: PyTorchObs, self_actions: th.Tensor, critic: DistributionalCritic) -> Choice:
         """
+        Decide which policy acts in each state (T_c).
+
         :param observation: batch of observations
         :param self_actions: a_r, shape (batch_size, action_dim); a_g is the mode of pi_g
         :param critic: Z_c, or its target copy
@@ -109,6 +113,8 @@ class CHACPolicy(DPVPPolicy):
 
     def _predict_in_stage_2(self, observation: PyTorchObs, deterministic: bool) -> tuple[th.Tensor, Choice | None]:
         """
+        Act in stage 2, by pi_r or by shared control.
+
         :return: the actions of pi_r, or of shared control with what it decided
         """
         self_actions = self.averaged_self_actor(observation, True) if deterministic else self.self_actor(observation)

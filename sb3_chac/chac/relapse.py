@@ -1,3 +1,5 @@
+"""Relapses of C-HAC's stage 2, and the best policy."""
+
 import math
 from collections import deque
 from typing import Any, NamedTuple
@@ -40,6 +42,8 @@ class RelapseWatch:
 
     def add(self, score: float) -> None:
         """
+        Note the score of an episode.
+
         :param score: of an episode that is over
         """
         self.scores.append(score)

@@ -3,6 +3,7 @@
 import ipaddress
 import json
 import math
+import socket
 import time
 from contextlib import suppress
 from typing import Any, Literal, NamedTuple
@@ -13,6 +14,7 @@ KEYS = {"left", "right", "up", "down"}
 COMMANDS = {command.value: command for command in (Command.PAUSE, Command.SKIP, Command.QUIT)}
 STALE = 0.3  # [s] without a message; the page sends every 50 ms
 TRIGGER = Pedal(0, 0.0, 1.0)  # as browsers report them
+MOMENT = 1.0  # [s] from the last touch until a takeover that began with one is handed back
 
 
 class Address(NamedTuple):
@@ -25,6 +27,23 @@ class Address(NamedTuple):
     def is_loopback(self) -> bool:
         return self.host == "localhost" or (is_number(self.host) and ipaddress.ip_address(self.host).is_loopback)
 
+    def from_elsewhere(self) -> "Address":
+        """
+        The address as other machines use it.
+
+        :return: itself, but with this machine's address in its network in place of "all addresses"
+        """
+        if not (is_number(self.host) and ipaddress.ip_address(self.host).is_unspecified):
+            return self
+        own, anywhere = ("::1", "2001:db8::1") if ":" in self.host else ("127.0.0.1", "192.0.2.1")
+        with (
+            suppress(OSError),
+            socket.socket(socket.AF_INET6 if ":" in self.host else socket.AF_INET, socket.SOCK_DGRAM) as out,
+        ):
+            out.connect((anywhere, 9))  # sends nothing, but chooses the way there
+            own = out.getsockname()[0]
+        return Address(own, self.port)
+
     def url(self, token: str, scheme: str = "http") -> str:
         host = f"[{self.host}]" if ":" in self.host else self.host
         return f"{scheme}://{host}:{self.port}/?token={token}"
@@ -32,6 +51,8 @@ class Address(NamedTuple):
 
 def parse_address(text: str) -> Address:
     """
+    Parse the address to serve on.
+
     :param text: HOST:PORT or PORT (then on loopback)
     :raises ValueError: if it is neither
     """
@@ -44,6 +65,8 @@ def parse_address(text: str) -> Address:
 
 def is_number(host: str) -> bool:
     """
+    Tell IP addresses from names.
+
     :return: whether it is an IP address, not a name
     """
     with suppress(ValueError):
@@ -58,11 +81,13 @@ class BadMessage(ValueError):
 
 class Held(NamedTuple):
     """
-    What the driver holds: keys, and a gamepad if there is one (stick to the right, right trigger, left trigger).
+    What the driver holds: keys, a gamepad if there is one (stick to the right, right trigger, left trigger), and while the
+    screen is touched, steering (-1 left to 1 right) and pedals (-1 brake to 1 throttle) of its pads.
     """
 
     keys: frozenset[str]
-    gamepad: tuple[float, float, float] | None
+    gamepad: tuple[float, ...] | None
+    touch: tuple[float, ...] | None = None
 
 
 class Wish(NamedTuple):
@@ -74,7 +99,10 @@ class Wish(NamedTuple):
 
 def parse(text: str) -> Held | Wish:
     """
-    :param text: JSON, ``{"keys": [...], "gamepad": null or [x, y, z]}``, ``{"wish": name}`` or ``{"ping": number}``
+    Parse a message of the page.
+
+    :param text: JSON, ``{"keys": [...], "gamepad": null or [x, y, z]}``, also with ``"touch": null or [x, y]``,
+        ``{"wish": name}`` or ``{"ping": number}``
     :raises BadMessage: for everything else
     """
     try:
@@ -82,10 +110,10 @@ def parse(text: str) -> Held | Wish:
     except (ValueError, RecursionError) as error:
         raise BadMessage("no JSON") from error
     match data:
-        case {"keys": list(keys), "gamepad": gamepad} if len(data) == 2:
+        case {"keys": list(keys), "gamepad": gamepad, **more} if set(more) <= {"touch"}:
             if len(keys) > len(KEYS) or not all(isinstance(key, str) and key in KEYS for key in keys):
                 raise BadMessage("unknown keys")
-            return Held(frozenset(keys), _gamepad(gamepad))
+            return Held(frozenset(keys), _axes(gamepad, 3, "a gamepad"), _axes(more.get("touch"), 2, "a touch"))
         case {"wish": ("pause" | "skip" | "quit" | "takeover" | "wheel" | "away") as name} if len(data) == 1:
             return Wish(name)
         case {"ping": int(number)} if len(data) == 1 and not isinstance(number, bool) and 0 <= number < 2**53:
@@ -93,20 +121,23 @@ def parse(text: str) -> Held | Wish:
     raise BadMessage("unknown message")
 
 
-def _gamepad(values: Any) -> tuple[float, float, float] | None:
+def _axes(values: Any, count: int, name: str) -> tuple[float, ...] | None:
     if values is None:
         return None
-    if not isinstance(values, list) or len(values) != 3:
-        raise BadMessage("a gamepad has three values")
+    if not isinstance(values, list) or len(values) != count:
+        raise BadMessage(f"{name} has {count} values")
     for value in values:
         if isinstance(value, bool) or not isinstance(value, int | float) or not -1 <= value <= 1:
-            raise BadMessage("values of a gamepad are from -1 to 1")
-    return float(values[0]), float(values[1]), float(values[2])
+            raise BadMessage(f"values of {name} are from -1 to 1")
+    return tuple(map(float, values))
 
 
 class Browser:
     """
     The device of who drives in a browser: nobody at first. It is lost if nothing was heard of the driver for ``STALE``.
+
+    Pressing a driving key and touching a pad take over. A takeover that began with a touch is handed back ``MOMENT`` after the
+    last thumb has left the screen, so that a thumb may move from one place to another; any other one by the driver's wish.
 
     :param clock: [s]
     """
@@ -131,19 +162,25 @@ class Browser:
     def go_away(self) -> None:
         """Whoever is there looks elsewhere, until the next message."""
         self.ramps.stop()
-        self.gamepad: tuple[float, float, float] | None = None
+        self.gamepad: tuple[float, ...] | None = None
+        self.touch: tuple[float, ...] | None = None
+        self.by_touch = False  # whether the takeover began with a touch
+        self.released_at = math.inf  # when the last thumb left the screen, if the takeover depends on it
         self.heard_at = -math.inf
 
     def handle(self, event: Any) -> Command | None:
         """
+        Take in an event of the person at the wheel.
+
         :param event: ``Held`` or ``Wish`` of who sits at the wheel
         """
         now = self.clock()
         if isinstance(event, Held):
             if event.keys - self.ramps.held:
-                self.takeover = True
-            if event.keys != self.ramps.held or event.gamepad != self.gamepad:
+                self.takeover, self.by_touch, self.released_at = True, False, math.inf
+            if (event.keys, event.gamepad, event.touch) != (self.ramps.held, self.gamepad, self.touch):
                 self.time = now
+            self._feel(event.touch, now)
             self.ramps.hold(event.keys)
             self.gamepad = event.gamepad
             self.heard_at = now
@@ -152,17 +189,34 @@ class Browser:
                 self.go_away()
             elif event.name == "takeover":
                 self.takeover, self.time = not self.takeover, now
+                self.by_touch, self.released_at = False, math.inf
             return COMMANDS.get(event.name)
         return None
 
+    def _feel(self, touch: tuple[float, ...] | None, now: float) -> None:
+        self._hand_back_in_time(now)
+        if touch is not None and self.touch is None:
+            self.by_touch |= not self.takeover
+            self.takeover, self.released_at = True, math.inf
+        elif touch is None and self.touch is not None and self.by_touch:
+            self.released_at = now
+        self.touch = touch
+
+    def _hand_back_in_time(self, now: float) -> None:
+        if now - self.released_at >= MOMENT:
+            self.hand_back()
+
     def read(self) -> DriverInput:
+        self._hand_back_in_time(self.clock())
         steering, pedals = self.ramps.move()
         if self.gamepad is not None and not self.ramps.held:
             stick, throttle, brake = self.gamepad
             steering, braking = GAMEPAD.steering.value(stick), TRIGGER.value(brake)
             pedals = -braking if braking > 0 else TRIGGER.value(throttle)
+        if self.touch is not None and not self.ramps.held:
+            steering, pedals = self.touch
         connected = self.taken and self.clock() - self.heard_at < STALE
         return DriverInput(steering, pedals, self.takeover, connected, self.time)
 
     def hand_back(self) -> None:
-        self.takeover = False
+        self.takeover, self.by_touch, self.released_at = False, False, math.inf

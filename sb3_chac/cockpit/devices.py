@@ -44,6 +44,8 @@ class Device(Protocol):
 
     def handle(self, event: Any) -> Command | None:
         """
+        Take in an event.
+
         :param event: of pygame, or a message of the browser; those of others are left alone
         :return: what is to be done, None for nothing
         """
@@ -74,6 +76,8 @@ class Ramps:
 
     def hold(self, keys: frozenset[str]) -> None:
         """
+        Set the keys that are held.
+
         :param keys: those that are held from now on
         """
         self.move()
@@ -81,6 +85,8 @@ class Ramps:
 
     def move(self) -> tuple[float, float]:
         """
+        Move towards the keys that are held.
+
         :return: steering and pedals now
         """
         now = self.clock()
@@ -177,6 +183,8 @@ class Steering:
 
     def value(self, raw: float) -> float:
         """
+        Convert a raw axis to steering.
+
         :return: -1 (left) to 1 (right)
         """
         to_right = (raw - self.centre) / (self.right - self.centre)
@@ -202,6 +210,8 @@ class Pedal:
 
     def value(self, raw: float) -> float:
         """
+        Convert a raw axis to a pedal.
+
         :return: 0 (released) to 1 (pressed)
         """
         share = (raw - self.released) / (self.pressed - self.released)
@@ -298,6 +308,8 @@ class Joystick:
 
 def is_wheel(name: str) -> bool:
     """
+    Tell steering wheels from gamepads by their name.
+
     :param name: that a device gives itself
     """
     return any(part in name.lower() for part in WHEEL_NAMES)
@@ -308,6 +320,8 @@ def is_wheel(name: str) -> bool:
 
 def save_config(file: Path, config: JoystickConfig) -> None:
     """
+    Write the configuration of a device.
+
     :param file: YAML, is overwritten
     """
     data: dict[str, Any] = {"name": config.name}
@@ -321,6 +335,8 @@ def save_config(file: Path, config: JoystickConfig) -> None:
 
 def load_config(file: Path) -> JoystickConfig:
     """
+    Read the configuration of a device.
+
     :param file: as ``save_config`` writes it; dead zones, exponent, pause and skip may be left out
     :raises DeviceError: names what is wrong in it
     """
@@ -420,6 +436,8 @@ class Calibration:
 
     def handle(self, event: Any) -> None:
         """
+        Take in an event of the device.
+
         :param event: of pygame
         """
         if event.type == self._pygame.JOYAXISMOTION:
@@ -449,6 +467,8 @@ class Calibration:
 
     def _moved(self, before: dict[int, float], after: dict[int, float], step: str = "") -> tuple[int, float]:
         """
+        Find the axis that moved.
+
         :return: the axis that moved most, and by how much. Where it was before its first event is not known: what is
             seen later tells
         """
@@ -464,6 +484,8 @@ class Calibration:
 
     def config(self) -> JoystickConfig:
         """
+        Return the configuration that the answers make.
+
         :return: what was found out
         :raises DeviceError: if a question is open
         """

@@ -37,18 +37,24 @@ class DeviceEmulator:
 
     def press(self, key: int) -> None:
         """
+        Press a key and hold it.
+
         :param key: pygame.K_...
         """
         self._post(pygame.KEYDOWN, key=key)
 
     def release(self, key: int) -> None:
         """
+        Let go of a key.
+
         :param key: pygame.K_...
         """
         self._post(pygame.KEYUP, key=key)
 
     def tap(self, key: int) -> None:
         """
+        Press a key and let go of it.
+
         :param key: pygame.K_...
         """
         self.press(key)
@@ -77,6 +83,8 @@ class DeviceEmulator:
 
     def axis(self, axis: int, value: float) -> None:
         """
+        Move an axis.
+
         :param axis: number
         :param value: -1 to 1, raw
         """
@@ -84,6 +92,8 @@ class DeviceEmulator:
 
     def button(self, button: int) -> None:
         """
+        Press a button and let go of it.
+
         :param button: number, is pressed and let go
         """
         for kind in (pygame.JOYBUTTONDOWN, pygame.JOYBUTTONUP):

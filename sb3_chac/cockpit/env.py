@@ -35,6 +35,9 @@ class Cockpit(gym.Wrapper):
         super().__init__(env)
         self.drive, self.recorder = drive, recorder
         self.steps = 0  # of the episode
+        self._touched = False  # whether the vehicle touched something in the last step
+        if isinstance(self.unwrapped, TakeoverDisplay):
+            self.unwrapped.panel = False  # each number is shown once, beside the picture
         self._rng = np.random.default_rng()
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
@@ -46,6 +49,7 @@ class Cockpit(gym.Wrapper):
         observation, info = self.env.reset(seed=seed, options=options)
         self.recorder.begin(observation, seed, options)
         self.steps = 0
+        self._touched = False
         self._show(info, takeover=False, episode=self.drive.display.episode + 1)
         return observation, info
 
@@ -72,6 +76,7 @@ class Cockpit(gym.Wrapper):
             human_steps=drive.display.human_steps + bool(info["takeover"]),
             seconds=drive.display.seconds + drive.period,
             cost=drive.display.cost + info.get("cost", 0.0),
+            collisions=drive.display.collisions + self._has_collided(info),
             novice=drive.novice,
         )
         return observation, reward, terminated, truncated, info
@@ -86,16 +91,27 @@ class Cockpit(gym.Wrapper):
         while True:
             observation, _, terminated, truncated, info = vehicle.step(brake)
             seconds += drive.period
-            self._show(info, takeover=True, applied=person.as_input(brake))
+            self._show(info, takeover=False, brakes=True, applied=person.as_input(brake))
             stands = info["speed"] < STANDS if "speed" in info else seconds >= BRAKING
             if terminated or truncated or stands or seconds >= MAX_BRAKING:
                 break
             drive.wait_for_tick()
         person.hand_back()
+        drive.show(brakes=False)
         drive.take_skip()
         drive.pause("Braked. " + message)
         drive.wait_for_tick()  # the vehicle is to be seen where it stands
         return observation, 0.0, False, True, {**info, "unattended": True}
+
+    def _has_collided(self, info: dict[str, Any]) -> bool:
+        """
+        Whether a collision has begun; environments report one by ``collision``, or by ``crashed`` for as long as it lasts.
+
+        :param info: of a step
+        :return: whether one has begun in it
+        """
+        before, self._touched = self._touched, bool(info.get("crashed", False))
+        return bool(info.get("collision", self._touched and not before))
 
     def _show(self, info: dict[str, Any], takeover: bool, **changes: Any) -> None:
         if isinstance(self.unwrapped, TakeoverDisplay):
@@ -104,4 +120,4 @@ class Cockpit(gym.Wrapper):
         if isinstance(picture, list):
             picture = picture[-1]
         changes |= {"picture": np.asarray(picture), "number": self.drive.display.number + 1}
-        self.drive.show(takeover=takeover, speed=info.get("speed"), **changes)
+        self.drive.show(takeover=takeover, speed=info.get("speed"), route=info.get("route_completion"), **changes)

@@ -18,7 +18,9 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import MaybeCallback
 
 from sb3_chac.chac import CHAC
+from sb3_chac.cockpit.meter import GuidanceMeter
 from sb3_chac.cockpit.session import Drive, DriveEnded, Novice
+from sb3_chac.common.critics import DistributionalCritic
 from sb3_chac.common.guided import GuidedOffPolicyAlgorithm
 from sb3_chac.hg_dagger import HGDagger
 
@@ -26,6 +28,9 @@ if TYPE_CHECKING:
     Base = GuidedOffPolicyAlgorithm
 else:
     Base = object
+
+
+LOW = -1.2816  # the 10 % quantile of the normal distribution
 
 
 class Learner(threading.Thread):
@@ -48,6 +53,8 @@ class Learner(threading.Thread):
 
     def owe(self, gradient_steps: int) -> None:
         """
+        Add gradient steps to those that are still to be made.
+
         :param gradient_steps: to be made
         :raises BaseException: what a gradient step has raised
         """
@@ -139,6 +146,7 @@ class DrivenTraining(Base):
         self._buffer_lock = threading.Lock()
         self._driving_lock = threading.Lock()  # held while the driving policy acts or is refreshed
         self._learner_logger = Logger(None, [])
+        self._meter = GuidanceMeter(drive.query)
         self._driving_policy = copy.deepcopy(self._learning_policy)
         self._pairs = tuple(
             [*policy.parameters(), *policy.buffers()] for policy in (self._driving_policy, self._learning_policy)
@@ -206,7 +214,7 @@ class DrivenTraining(Base):
 
     @property
     def stage_name(self) -> str:
-        return "you guide"
+        return "guided"
 
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
@@ -215,20 +223,47 @@ class DrivenTraining(Base):
             self._this_thread.acts = True
             try:
                 sampled = super()._sample_action(learning_starts, action_noise, n_envs)
-                self._tell()
+                self._tell(sampled[1])
             finally:
                 self._this_thread.acts = False
         return sampled
 
-    def _tell(self) -> None:
-        """What the display shows of the novice."""
+    def _tell(self, actions: np.ndarray | None = None) -> None:
+        """
+        What the display shows of the novice.
+
+        :param actions: that it is about to do, scaled to [-1, 1], shape (1, 2)
+        """
         choice = getattr(self.policy, "last_choice", None)
-        self.drive.novice = (
-            Novice(self.stage_name)
-            if choice is None
-            else Novice(self.stage_name, bool(choice.self_drives[0]), float(choice.confidence[0]))
+        risk = self._meter.tell(None if actions is None else self._proxy_value(actions))
+        self.drive.novice = Novice(
+            self.stage_name,
+            None if choice is None else bool(choice.self_drives[0]),
+            None if choice is None else float(choice.confidence[0]),
+            risk,
+            self._meter.asks,
         )
         self.drive.show(novice=self.drive.novice)
+
+    @th.no_grad()
+    def _proxy_value(self, actions: np.ndarray) -> float | None:
+        """
+        The proxy value that the guidance meter ranks.
+
+        :param actions: scaled to [-1, 1], shape (1, 2)
+        :return: the 10 % quantile of Z_g (PVP: the smaller Q_g) of the action in the present state; None before the first
+            gradient step, and for algorithms without a proxy value
+        """
+        critic = getattr(self.policy, "critic", None)
+        if critic is None or not self._n_updates:
+            return None
+        assert self._last_obs is not None
+        obs, _ = self.policy.obs_to_tensor(self._last_obs)
+        action = th.as_tensor(actions, dtype=th.float32, device=self.device)
+        if isinstance(critic, DistributionalCritic):
+            mean, std = critic.pessimistic(obs, action)
+            return float(mean[0] + LOW * std[0])
+        return min(float(q_value[0]) for q_value in critic(obs, action))
 
     def _store_transition(
         self,
@@ -326,7 +361,7 @@ class DrivenStages(DrivenTraining):
         if self.stage == 2:  # type: ignore[attr-defined]
             watch = self.watch  # type: ignore[attr-defined]
             return "2: RELAPSE" if watch is not None and watch.relapsed else "2: self-learning"
-        return "1: you guide" if self.prefit_left is None else "1: prepares 2"
+        return "1: guided" if self.prefit_left is None else "1: prepares 2"
 
 
 class DrivenRounds(DrivenTraining):
@@ -349,12 +384,14 @@ class DrivenRounds(DrivenTraining):
     @property
     def stage_name(self) -> str:
         assert isinstance(self, HGDagger)
-        return f"round {self.round}" if self.round else "warm-up: you drive"
+        return f"round {self.round}" if self.round else "warm-up"
 
 
 @functools.cache
 def driven(algorithm: type[GuidedOffPolicyAlgorithm]) -> type[Any]:
     """
+    Derive the class of an algorithm that learns while a person drives.
+
     :param algorithm: that learns from takeovers
     :return: the same algorithm for a drive, see ``DrivenTraining``; what it saves is the algorithm's
     """

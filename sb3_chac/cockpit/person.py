@@ -9,9 +9,6 @@ from gymnasium import spaces
 
 from sb3_chac.cockpit.devices import Command, Device, DriverInput
 
-# Environments whose first action is positive to the left; elsewhere it is to the right
-STEERS_LEFT = ("MetaDriveSafety-v0",)
-
 
 class NotDrivable(ValueError):
     """Raised for an environment that nobody can drive in the cockpit; says why."""
@@ -19,6 +16,8 @@ class NotDrivable(ValueError):
 
 def check_drivable(env: gym.Env) -> None:
     """
+    Check that a person can drive an environment in the cockpit.
+
     :raises NotDrivable: unless actions are a Box of two numbers and pictures can be had
     """
     space = env.action_space
@@ -49,6 +48,8 @@ class Person:
 
     def sit_in(self, box: spaces.Box, steers_left: bool = False) -> None:
         """
+        Prepare for the actions of an environment.
+
         :param box: action space, shape (2,): steering, then throttle (its upper bound) or brake (its lower bound)
         :param steers_left: whether the greatest first action is fully to the left
         """
@@ -56,6 +57,8 @@ class Person:
 
     def handle(self, event: Any) -> Command | None:
         """
+        Hand an event to the device.
+
         :param event: for the device
         :return: what the person wants to be done
         """
@@ -79,6 +82,8 @@ class Person:
 
     def hold(self, device: Device) -> None:
         """
+        Change the device.
+
         :param device: to drive with from now on
         """
         with self.lock:
@@ -91,6 +96,8 @@ class Person:
 
     def action(self, steering: float, pedals: float) -> np.ndarray:
         """
+        Convert steering and pedals to an action.
+
         :param steering: -1 (left) to 1 (right)
         :param pedals: -1 (brake) to 1 (throttle)
         :return: the action in the units of the environment, shape (2,)
@@ -100,6 +107,8 @@ class Person:
 
     def as_input(self, action: np.ndarray) -> tuple[float, float]:
         """
+        Convert an action to steering and pedals.
+
         :param action: in the units of the environment, shape (2,)
         :return: steering (-1 left to 1 right) and pedals (-1 brake to 1 throttle)
         """

@@ -118,6 +118,8 @@ class Recorder:
         self, action: Any, observation: np.ndarray, reward: float, terminated: bool, truncated: bool, info: dict[str, Any]
     ) -> None:
         """
+        Record one step.
+
         :param action: what the novice proposed
         :param observation: what followed
         """
@@ -153,6 +155,8 @@ class Recorder:
 
     def finish(self) -> Summary:
         """
+        Make the dataset and sum up the drive.
+
         :return: of the drive; the dataset is complete
         """
         self.end()
@@ -161,6 +165,8 @@ class Recorder:
 
 def finish_recording(run_folder: Path) -> Summary | None:
     """
+    Make the dataset of a drive that was killed.
+
     :param run_folder: of a drive that was killed
     :return: its summary, now that the dataset is made; None if nothing was left behind
     """
@@ -207,6 +213,8 @@ def _finish(run_folder: Path, env: gym.Env) -> Summary:
 
 def _episode(columns: dict[str, np.ndarray]) -> "EpisodeBuffer":
     """
+    Convert the columns of a recording file to an episode.
+
     :param columns: of a file
     :return: the episode as Minari stores it, the infos of an action at the index of what followed it
     """
@@ -249,6 +257,8 @@ def _summary(episodes: list[dict[str, np.ndarray]], dataset: Path | None, second
 
 def write_safely(file: Path, content: bytes) -> None:
     """
+    Replace a file in one go.
+
     :param file: holds what it held before, or all of ``content``, whenever the process is killed
     """
     temporary = file.with_name(file.name + ".tmp")

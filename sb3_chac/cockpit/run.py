@@ -16,7 +16,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from sb3_chac.cockpit.devices import Device
 from sb3_chac.cockpit.env import Cockpit
 from sb3_chac.cockpit.learner import DrivenTraining, driven
-from sb3_chac.cockpit.person import STEERS_LEFT, NotDrivable, Person, check_drivable
+from sb3_chac.cockpit.person import NotDrivable, Person, check_drivable
 from sb3_chac.cockpit.recording import Recorder, Summary
 from sb3_chac.cockpit.session import Drive
 from sb3_chac.common.checkpoints import ResumableCheckpoint
@@ -97,7 +97,7 @@ class DriveRun:
     def __init__(self, args: argparse.Namespace, device: Device) -> None:
         register()
         self.args = args
-        self.drive = Drive(Person(device), args.rate or DEFAULT_RATE)
+        self.drive = Drive(Person(device), args.rate or DEFAULT_RATE, args.query)
         self.summary: Summary | None = None
         self.run_folder: Path | None = None
         self.error: BaseException | None = None
@@ -159,7 +159,7 @@ class DriveRun:
     def _wrap(self, env: gym.Env) -> gym.Env:
         check_drivable(env)
         args, person = self.args, self.drive.person
-        steers_left = args.env in STEERS_LEFT if args.steering == "auto" else args.steering == "left"
+        steers_left = bool(env.metadata.get("steers_left")) if args.steering == "auto" else args.steering == "left"
         person.sit_in(env.action_space, steers_left)  # type: ignore[arg-type]
         if args.rate is None:
             self.drive.period = 1 / float(env.metadata.get("render_fps") or DEFAULT_RATE)

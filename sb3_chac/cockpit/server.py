@@ -1,4 +1,5 @@
-"""The cockpit for a browser: the page, the pictures and what the driver does, over one WebSocket per viewer.
+"""
+The cockpit for a browser: the page, the pictures and what the driver does, over one WebSocket per viewer.
 
 Who may connect: only who has the access token of this drive, from a page that this server has sent. See ``Server``.
 """
@@ -23,13 +24,14 @@ import numpy as np
 from PIL import Image
 
 try:
+    import segno
     from aiohttp import WSCloseCode, WSMsgType, web
 except ImportError as error:
-    raise RuntimeError('--serve needs aiohttp: pip install "aiohttp>=3.10".') from error
+    raise RuntimeError('--serve needs aiohttp and segno: pip install "aiohttp>=3.10" segno.') from error
 
 from sb3_chac.cockpit.browser import Address, BadMessage, Browser, Held, Wish, is_number, parse
 from sb3_chac.cockpit.devices import Clock
-from sb3_chac.cockpit.session import Drive, indicators
+from sb3_chac.cockpit.session import Drive, asks_for_help, indicators, who_drives
 
 logger = logging.getLogger(__name__)
 
@@ -203,6 +205,8 @@ class Server:
 
     def _remark(self, text: str) -> None:
         """
+        Log a remark, without any token.
+
         :param text: for the log, without a token
         """
         if not self._remarks.is_flooded():
@@ -214,12 +218,16 @@ class Server:
 
     def url(self, token: str) -> str:
         """
+        Build the address of the page.
+
         :param token: one of the two
         """
-        return self.address.url(token, self.scheme)
+        return self.address.from_elsewhere().url(token, self.scheme)
 
     def _may_drive(self, request: web.Request) -> bool:
         """
+        Tell whether a request may drive or only watch.
+
         :raises HTTPForbidden: if it may not even watch
         """
         token = request.query.get("token", "").encode()
@@ -337,9 +345,12 @@ class Server:
 
     def state(self, viewer: Viewer) -> dict[str, Any]:
         """
+        Collect what the page shows besides the picture.
+
         :return: what the page shows besides the picture
         """
         drive, display, now = self.drive, self.drive.display, self.drive.person.read()
+        driver = who_drives(display, now.connected)
         if viewer is self.driver:
             role = "driver"
         elif not viewer.may_drive:
@@ -350,10 +361,15 @@ class Server:
             "role": role,
             "notice": drive.notice,
             "waits": bool(drive.paused or drive.busy or drive.ended),
-            "takeover": display.takeover,
+            "paused": drive.paused,
+            "driver": driver,
+            "takeover": driver == "person",
+            "collisions": display.collisions,
             "wants": now.takeover,
-            "indicators": indicators(display, drive.lag),
+            "indicators": indicators(display, drive.lag, now.connected, role != "driver"),
             "confidence": display.novice.confidence,
+            "risk": display.novice.risk,
+            "asks": asks_for_help(display, driver),
             "proposed": display.proposed,
             "applied": display.applied,
             "input": (now.steering, now.pedals),
@@ -381,6 +397,8 @@ class _Refusal(asyncio.Protocol):
 
 def as_jpeg(picture: np.ndarray) -> bytes:
     """
+    Compress a picture.
+
     :param picture: shape (height, width, 3), uint8
     """
     file = io.BytesIO()
@@ -388,8 +406,22 @@ def as_jpeg(picture: np.ndarray) -> bytes:
     return file.getvalue()
 
 
+def qr_code(text: str) -> str:
+    """
+    Draw a QR code.
+
+    :param text: what a phone's camera is to read
+    :return: lines for a terminal
+    """
+    lines = io.StringIO()
+    segno.make(text, micro=False).terminal(lines, compact=True)
+    return lines.getvalue()
+
+
 def tls_context(certificate: Path, key: Path | None) -> ssl.SSLContext:
     """
+    Load a certificate.
+
     :param certificate: PEM
     :param key: PEM, None if it is in the same file
     :raises ValueError: if they cannot be used
@@ -435,6 +467,8 @@ async def serve(
             )
         print(f"Drive at  {server.url(server.driver_token)}")
         print(f"Watch at  {server.url(server.spectator_token)}", flush=True)
+        if not server.address.is_loopback and sys.stdout.isatty():
+            print("Drive with a phone in this network:\n" + qr_code(server.url(server.driver_token)), flush=True)
         begin()
         while not is_over():
             await asyncio.sleep(0.1)

@@ -25,11 +25,15 @@ class Novice:
     :param stage: of the training, to read
     :param self_drives: C-HAC in stage 2: whether the self-learning policy acts
     :param confidence: C-HAC in stage 2: P(Q_r > Q_g)
+    :param risk: rank of the proxy value of what it is about to do, see ``GuidanceMeter``
+    :param asks: whether it asks for help
     """
 
     stage: str = ""
     self_drives: bool | None = None
     confidence: float | None = None
+    risk: float | None = None
+    asks: bool = False
 
 
 @dataclass(frozen=True)
@@ -40,7 +44,9 @@ class Display:
     :param picture: of the environment, shape (height, width, 3), uint8
     :param number: of the picture
     :param speed: [m/s], None if the environment does not tell
+    :param route: share of the route that is driven, None if the environment does not tell
     :param takeover: whether the person drove
+    :param brakes: whether the vehicle was braked because nobody is at the wheel
     :param proposed: by the novice: steering (-1 left to 1 right) and pedals (-1 brake to 1 throttle)
     :param applied: what was executed
     :param total_steps: of the training
@@ -48,12 +54,15 @@ class Display:
     :param seconds: [s] driven, without pauses
     :param episode: number of the episode in this drive
     :param cost: safety cost of this drive
+    :param collisions: of this drive
     """
 
     picture: np.ndarray | None = None
     number: int = 0
     speed: float | None = None
+    route: float | None = None
     takeover: bool = False
+    brakes: bool = False
     proposed: tuple[float, float] = (0.0, 0.0)
     applied: tuple[float, float] = (0.0, 0.0)
     total_steps: int = 0
@@ -61,6 +70,7 @@ class Display:
     seconds: float = 0.0
     episode: int = 0
     cost: float = 0.0
+    collisions: int = 0
     novice: Novice = Novice()
 
     @property
@@ -74,10 +84,12 @@ class Drive:
 
     :param person: at the wheel
     :param rate: [1/s] steps in real time, at most
+    :param query: risk from which the novice asks for help, see ``GuidanceMeter``; None never to ask
     """
 
-    def __init__(self, person: Person, rate: float = 10.0) -> None:
+    def __init__(self, person: Person, rate: float = 10.0, query: float | None = None) -> None:
         self.person = person
+        self.query = query
         self.period = 1 / rate
         self.display = Display()  # replaced as a whole
         self.novice = Novice()
@@ -94,6 +106,8 @@ class Drive:
 
     def pause(self, message: str = "Paused: P goes on") -> None:
         """
+        Stop the clock.
+
         :param message: why
         """
         with self._changed:
@@ -127,6 +141,8 @@ class Drive:
 
     def obey(self, command: Command | None) -> None:
         """
+        Carry out a command of the person.
+
         :param command: of the person; those that concern the display alone are left to it
         """
         match command:
@@ -167,6 +183,8 @@ class Drive:
 
     def take_skip(self) -> bool:
         """
+        Tell once whether the episode is to end.
+
         :return: whether the episode is to end
         """
         with self._changed:
@@ -175,6 +193,8 @@ class Drive:
 
     def show(self, **changes: Any) -> None:
         """
+        Change what is displayed.
+
         :param changes: of ``display``
         """
         self.display = replace(self.display, **changes)
@@ -183,6 +203,8 @@ class Drive:
 
     def time_to_tick(self) -> float:
         """
+        Return the time that is left before the next step.
+
         :return: [s] until the next step, infinite in a pause
         """
         return float("inf") if self.paused else self._next_tick - time.monotonic()
@@ -202,6 +224,8 @@ class Drive:
 
 def lost_message(device: str) -> str:
     """
+    Word the message for a device that is gone.
+
     :param device: its name
     :return: what to tell a person whose device is gone
     """
@@ -212,23 +236,57 @@ def lost_message(device: str) -> str:
     return f"No {device}: plug it in, or press K for the keyboard; then P goes on"
 
 
-def indicators(display: Display, lag: int) -> list[tuple[str, str]]:
+def who_drives(display: Display, is_manned: bool) -> str:
     """
+    Tell who drives.
+
+    :param is_manned: whether somebody is at the wheel now
+    :return: "person", "brake" or "novice": never a person where nobody is
+    """
+    if display.brakes:
+        return "brake"
+    return ("person" if is_manned else "brake") if display.takeover else "novice"
+
+
+def asks_for_help(display: Display, driver: str) -> bool:
+    """
+    Tell whether the person should hear that help is wanted.
+
+    :param driver: see ``who_drives``
+    :return: whether the novice asks for help and has none yet
+    """
+    return display.novice.asks and driver == "novice"
+
+
+TAKEOVER = {"person": "YOU DRIVE", "brake": "nobody", "novice": "no"}
+FOR_OTHERS = "a person"  # what those see who only watch
+
+
+def indicators(display: Display, lag: int, is_manned: bool = True, watches: bool = False) -> list[tuple[str, str]]:
+    """
+    Collect the indicators of the paper's display.
+
     :param lag: gradient steps that the learner owes
+    :param is_manned: whether somebody is at the wheel now
+    :param watches: whether it is shown to somebody who is not at the wheel
     :return: names and values of what the paper's display shows, and how far the learner lags behind
     """
-    novice = display.novice
+    novice, driver = display.novice, who_drives(display, is_manned)
+    risk = "-" if novice.risk is None else f"{novice.risk:.0%}"
+    acts = "in use" if novice.self_drives and driver == "novice" else "no"
     minutes, seconds = divmod(int(display.seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return [
         ("speed", "-" if display.speed is None else f"{3.6 * display.speed:.0f} km/h"),
-        ("takeover", "YOU DRIVE" if display.takeover else "no"),
+        ("takeover", FOR_OTHERS if driver == "person" and watches else TAKEOVER[driver]),
+        ("route", "-" if display.route is None else f"{display.route:.0%}"),
         ("total step", f"{display.total_steps}"),
         ("total time", f"{hours}:{minutes:02}:{seconds:02}"),
         ("takeover rate", f"{display.takeover_rate:.1%}"),
         ("stage", novice.stage or "-"),
-        ("self-learning", "-" if novice.self_drives is None else "in use" if novice.self_drives else "no"),
+        ("self-learning", "-" if novice.self_drives is None else acts),
         ("confidence", "-" if novice.confidence is None else f"{novice.confidence:.2f}"),
+        ("risk", f"HELP {risk}" if asks_for_help(display, driver) else risk),
         ("cost", f"{display.cost:g}"),
         ("episode", f"{display.episode}"),
         ("updates behind", f"{lag}" if lag else "none"),

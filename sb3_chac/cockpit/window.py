@@ -9,8 +9,8 @@ import numpy as np
 import pygame
 
 from sb3_chac.cockpit.devices import Command, Keyboard
-from sb3_chac.cockpit.session import Display, Drive, indicators
-from sb3_chac.envs.display import BLACK, EGO, HUMAN, ORANGE, PANEL, RED, TEXT
+from sb3_chac.cockpit.session import Display, Drive, asks_for_help, indicators, who_drives
+from sb3_chac.envs.driving.display import BLACK, EGO, HUMAN, ORANGE, PANEL, RED, TEXT
 
 PICTURE = pygame.Rect(0, 0, 800, 600)
 SIDE = pygame.Rect(800, 0, 320, 600)
@@ -19,6 +19,7 @@ SIZE = 1120, 720
 FRAME_SECONDS = 0.033
 DRAWING_SECONDS = 0.012  # that drawing may take: not begun right before a step, for events wait meanwhile
 DIM, LINE, BAR = (140, 145, 155), (70, 76, 86), (42, 47, 56)
+COLOURS = {"person": HUMAN, "brake": RED, "novice": EGO}  # of who drives
 
 COMMANDS = {
     pygame.K_p: Command.PAUSE,
@@ -68,13 +69,15 @@ class Window:
         pygame.font.init()
         pygame.event.set_blocked(pygame.MOUSEMOTION)
         self.font, self.small, self.large = (pygame.font.Font(None, size) for size in (27, 22, 36))
-        self.help = True  # until the drive begins
+        self.help = False
         self.frames = 0
         self._drawn_at = 0.0
         self._picture: tuple[Any, pygame.Surface] | None = None
 
     def run(self, drive: Drive, is_over: Callable[[], bool]) -> None:
         """
+        Show a drive until it is over.
+
         :param drive: is shown
         :param is_over: asked after each frame
         """
@@ -95,6 +98,8 @@ class Window:
 
     def handle(self, event: Any) -> None:
         """
+        Take in an event of pygame.
+
         :param event: of pygame
         """
         command = self.drive.person.handle(event)
@@ -147,22 +152,28 @@ class Window:
         self.screen.blit(surface, surface.get_rect(center=PICTURE.center))
 
     def _draw_side(self, display: Display, lag: int) -> None:
-        pygame.draw.rect(self.screen, HUMAN if display.takeover else EGO, (SIDE.left, 0, 6, SIDE.height))
+        is_manned = self.drive.person.read().connected
+        driver = who_drives(display, is_manned)
+        colour_of_driver = COLOURS[driver]
+        pygame.draw.rect(self.screen, colour_of_driver, (SIDE.left, 0, 6, SIDE.height))
         y = 24
-        for name, value in indicators(display, lag):
-            colour = (
-                HUMAN if name == "takeover" and display.takeover else ORANGE if name.startswith("updates") and lag else TEXT
-            )
+        for name, value in indicators(display, lag, is_manned):
+            colour = TEXT
+            if name == "takeover" and colour_of_driver != EGO:
+                colour = colour_of_driver
+            elif (name.startswith("updates") and lag) or (name == "risk" and asks_for_help(display, driver)):
+                colour = ORANGE
             self._text(name, (SIDE.left + 24, y), self.font, DIM)
             self._text(value, (SIDE.right - 16, y), self.font, colour, "topright")
-            y += 36
-            if name == "confidence" and display.novice.confidence is not None:
-                bar = pygame.Rect(SIDE.left + 24, y - 6, SIDE.width - 40, 10)
+            y += 34
+            share = {"confidence": display.novice.confidence, "risk": display.novice.risk}.get(name)
+            if share is not None:
+                bar = pygame.Rect(SIDE.left + 24, y - 8, SIDE.width - 40, 10)
                 pygame.draw.rect(self.screen, BAR, bar, border_radius=3)
                 filled = bar.copy()
-                filled.width = round(bar.width * display.novice.confidence)
-                pygame.draw.rect(self.screen, EGO, filled, border_radius=3)
-                y += 18
+                filled.width = round(bar.width * share)
+                pygame.draw.rect(self.screen, EGO if name == "confidence" else ORANGE, filled, border_radius=3)
+                y += 14
         device = self.drive.person.device
         self._text(f"device: {device.name}", (SIDE.left + 24, SIDE.bottom - 56), self.small, DIM)
         self._text("H: help", (SIDE.left + 24, SIDE.bottom - 30), self.small, DIM)
@@ -170,13 +181,14 @@ class Window:
     def _draw_strip(self, display: Display) -> None:
         pygame.draw.line(self.screen, LINE, STRIP.topleft, STRIP.topright)
         now = self.drive.person.read()
+        driver = who_drives(display, now.connected)
         rows = (
             ("proposed", "by the novice", display.proposed, EGO),
             (
                 "applied",
-                "you drive" if display.takeover else "the novice's",
+                {"person": "you drive", "brake": "the brake", "novice": "the novice's"}[driver],
                 display.applied,
-                HUMAN if display.takeover else EGO,
+                COLOURS[driver],
             ),
             ("your input", self.drive.person.device.name, (now.steering, now.pedals), DIM),
         )

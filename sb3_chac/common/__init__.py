@@ -1,0 +1,1 @@
+"""Ground of the package, which imports none of its other parts."""

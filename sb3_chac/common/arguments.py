@@ -60,6 +60,8 @@ SCHEDULES = ("clip_range", "clip_range_vf")  # that nobody else checks; they may
 
 def checked(init: Init) -> Init:
     """
+    Decorate a constructor, so that its arguments are checked against their annotations.
+
     :param init: ``__init__`` of a class. What does not fit the annotation of an argument, or is NaN or infinite, raises a
         ``ValueError`` that begins with its name. Models that are being loaded get their arguments later and are left alone
     """
@@ -82,6 +84,8 @@ def checked(init: Init) -> Init:
 
 def annotations(init: Callable[..., None]) -> dict[str, Any]:
     """
+    Collect the annotations of the arguments of a constructor.
+
     :return: those of the arguments, by name
     """
     # SB3's GymEnv names the first, a Dataset of demonstrations the others, which say themselves what is wrong with one
@@ -90,6 +94,8 @@ def annotations(init: Callable[..., None]) -> dict[str, Any]:
 
 def check_argument(name: str, value: Any, hint: Any) -> None:
     """
+    Check one argument against its annotation.
+
     :param name: of the argument
     :param value: that it has
     :param hint: its annotation
@@ -117,6 +123,8 @@ NETWORKS = ("pi", "qf", "vf")  # actor, critic of actions, critic of states
 
 def check_policy_kwargs(name: str, owner: type, kwargs: dict[str, Any] | None, networks: tuple[str, ...] = ("pi",)) -> None:
     """
+    Check the keyword arguments of a policy, or of a part of it.
+
     :param name: of the argument ("policy_kwargs"), for the message
     :param owner: class that the keyword arguments are for
     :param kwargs: to be checked
@@ -147,6 +155,8 @@ def check_policy_kwargs(name: str, owner: type, kwargs: dict[str, Any] | None, n
 
 def check_keyword(name: str, owner: type, key: str, hints: dict[str, Any]) -> None:
     """
+    Check that a keyword argument is one of those of a class.
+
     :param hints: the keyword arguments that ``owner`` takes
     :raises ValueError: unless ``key`` is one of them
     """
@@ -157,6 +167,8 @@ def check_keyword(name: str, owner: type, key: str, hints: dict[str, Any]) -> No
 
 def check_net_arch(name: str, value: Any, networks: tuple[str, ...]) -> None:
     """
+    Check the sizes of hidden layers.
+
     :param name: of the argument that holds it
     :param value: the sizes of the hidden layers, or of those of each network
     :param networks: that there are: of an actor alone what a dict says of critics is ignored, PPO's may leave one out
@@ -179,6 +191,8 @@ def check_net_arch(name: str, value: Any, networks: tuple[str, ...]) -> None:
 
 def keywords(owner: type) -> tuple[dict[str, Any], dict[str, Any]]:
     """
+    Collect the keyword arguments of a class.
+
     :return: annotations and defaults of the keyword arguments of a class, by name: also of those that it hands on to its bases
     """
     found: dict[str, Any] = {}
@@ -205,6 +219,8 @@ GIVEN = ("observation_space", "action_space", "lr_schedule")  # to policies, by 
 
 def ends_of_schedule(name: str, schedule: Callable[[float], Any]) -> tuple[float, float]:
     """
+    Evaluate a schedule at its start and its end.
+
     :param name: of the argument
     :param schedule: of the remaining progress
     :return: its values at the start and at the end
@@ -219,6 +235,8 @@ def ends_of_schedule(name: str, schedule: Callable[[float], Any]) -> tuple[float
 
 def check_name(owner: type, name: str, value: Any) -> None:
     """
+    Check that a policy, environment or device exists.
+
     :param owner: class whose argument it is
     :raises ValueError: for a policy, an environment or a device that does not exist
     """
@@ -238,6 +256,8 @@ def check_name(owner: type, name: str, value: Any) -> None:
 
 def numbers_in(value: Any) -> list[float]:
     """
+    Find the number in an argument.
+
     :return: a number itself, the first of a train_freq; none of anything else
     """
     if isinstance(value, tuple) and value:
@@ -247,6 +267,8 @@ def numbers_in(value: Any) -> list[float]:
 
 def fits(value: Any, hint: Any) -> bool:
     """
+    Tell whether a value fits an annotation.
+
     :param hint: an annotation; what is none of the kinds below fits anything
     """
     origin, parts = typing.get_origin(hint), typing.get_args(hint)
@@ -277,6 +299,7 @@ def fits(value: Any, hint: Any) -> bool:
 
 
 def is_finite_number(value: Any) -> bool:
+    """Tell whether a value is a finite number."""
     try:
         return math.isfinite(value)
     except (OverflowError, TypeError):  # an int of hundreds of digits, a complex number
@@ -288,6 +311,8 @@ WORDS = {int: "an integer", float: "a finite number", bool: "True or False", str
 
 def describe(hint: Any) -> str:
     """
+    Word an annotation for a message.
+
     :param hint: an annotation
     :return: what it asks for, to read
     """

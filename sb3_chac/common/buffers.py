@@ -38,6 +38,8 @@ class DualReplayBufferSamples(NamedTuple):
 
 def take_rows(observations: th.Tensor | TensorDict, rows: th.Tensor) -> Any:
     """
+    Select rows of a batch of observations.
+
     :param observations: batch of observations, possibly a dictionary
     :param rows: indices
     :return: the observations of these rows
@@ -69,6 +71,8 @@ class TransitionStore:
 
     def append(self, row: dict[str, Any]) -> None:
         """
+        Store one transition.
+
         :param row: an entry for each column
         """
         for name, array in self.arrays.items():
@@ -87,6 +91,8 @@ class TransitionStore:
 
     def sample(self, n_rows: int) -> dict[str, np.ndarray]:
         """
+        Sample transitions.
+
         :return: rows drawn with replacement, an array of shape (n_rows, ...) per column
         """
         rows = np.random.randint(0, len(self), size=n_rows)
@@ -183,6 +189,8 @@ class DualReplayBuffer(ReplayBuffer):
 
     def size(self) -> int:
         """
+        Count the transitions of both stores.
+
         :return: number of transitions in both stores
         """
         return len(self.novice) + len(self.human)
@@ -202,6 +210,8 @@ class DualReplayBuffer(ReplayBuffer):
         infos: list[dict[str, Any]],
     ) -> None:
         """
+        Store one step of all environments.
+
         :param obs: shape (n_envs, ...), or a dictionary of such arrays, as ``next_obs``
         :param action: a_b, executed, scaled to [-1, 1], shape (n_envs, action_dim)
         :param reward: shape (n_envs,), as ``done``
@@ -276,6 +286,8 @@ class DualReplayBuffer(ReplayBuffer):
         self, batch_size: int, env: VecNormalize | None = None, human_share: float = 0.5
     ) -> DualReplayBufferSamples:
         """
+        Sample a batch from both stores.
+
         :param batch_size: number of transitions, novice rows first
         :param env: to normalize observations and rewards with
         :param human_share: share of the human's rows. As long as a store holds fewer rows than its part of the batch, all are

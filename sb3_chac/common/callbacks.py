@@ -9,7 +9,7 @@ from stable_baselines3.common.callbacks import BaseCallback, ProgressBarCallback
 from stable_baselines3.common.logger import CSVOutputFormat
 from tqdm.rich import FractionColumn, tqdm
 
-from sb3_chac.common.checks import number_in
+from sb3_chac.common.costs import TOTAL, measured_costs
 from sb3_chac.common.guided import GuidedOffPolicyAlgorithm
 
 PROGRESS_FILE = "progress.csv"
@@ -49,6 +49,8 @@ class GuidedProgressBar(ProgressBarCallback):
 
     def text(self) -> str:
         """
+        Word the progress.
+
         :return: e.g. "stage 2, self 31 %, human 12 % (1850 steps), cost 9"
         """
         counts = self.model.counts
@@ -60,8 +62,8 @@ class GuidedProgressBar(ProgressBarCallback):
             parts.append(f"self {100 * self.self_share:.0f} %")
         rate = counts["human_steps"] / max(counts["total_steps"], 1)
         parts.append(f"human {100 * rate:.0f} % ({counts['human_steps']:.0f} steps)")
-        if "safety_cost" in self.model.measured:
-            parts.append(f"cost {counts['safety_cost']:g}")
+        if self.model.safety_cost is not None:
+            parts.append(f"cost {self.model.safety_cost:g}")
         watch = getattr(self.model, "watch", None)
         if watch is not None and watch.relapsed:
             parts.append("RELAPSE")
@@ -80,11 +82,11 @@ class SafetyCost(BaseCallback):
         self.is_measured = hasattr(self.model, "safety_cost")
 
     def _on_step(self) -> bool:
-        costs = [number_in(info, "cost", idx) for idx, info in enumerate(self.locals["infos"])]
+        costs = measured_costs(self.locals["infos"])
         self.is_measured = self.is_measured or any(cost is not None for cost in costs)
         if self.is_measured:  # else it would look like a zero
             self.model.safety_cost = getattr(self.model, "safety_cost", 0.0) + sum(filter(None, costs))  # type: ignore[attr-defined]
-            self.logger.record("safety/safety_cost", self.model.safety_cost)  # type: ignore[attr-defined]
+            self.logger.record(TOTAL, self.model.safety_cost)  # type: ignore[attr-defined]
         return True
 
 
@@ -128,8 +130,7 @@ class CSVProgress(BaseCallback):
             row["chac/stage"] = self.stage
         if isinstance(self.model, GuidedOffPolicyAlgorithm):
             row["takeover/human_steps"] = self.model.counts["human_steps"]
-            if "safety_cost" in self.model.measured:
-                row["safety/safety_cost"] = self.model.counts["safety_cost"]
-        elif hasattr(self.model, "safety_cost"):
-            row["safety/safety_cost"] = self.model.safety_cost
+        safety_cost = getattr(self.model, "safety_cost", None)
+        if safety_cost is not None:
+            row[TOTAL] = safety_cost
         output.write(row, {})

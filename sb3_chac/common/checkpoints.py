@@ -123,6 +123,8 @@ class ResumableCheckpoint(BaseCallback):
 
     def farewell(self, reason: str) -> str:
         """
+        Word how to go on.
+
         :param reason: why it stops
         :return: one sentence that says where the training stopped and how it goes on
         """
@@ -165,6 +167,8 @@ class ResumableCheckpoint(BaseCallback):
 
     def _write(self, folder: Path) -> None:
         """
+        Write a checkpoint.
+
         :param folder: is made, and on the disk when this returns
         """
         shutil.rmtree(folder, ignore_errors=True)
@@ -190,6 +194,8 @@ class ResumableCheckpoint(BaseCallback):
 
 def check_finite_model(model: BaseAlgorithm) -> None:
     """
+    Check the parameters of a model.
+
     :raises ValueError: if a parameter is NaN or infinite; names it
     """
     for name, values in model.policy.state_dict().items():
@@ -223,6 +229,8 @@ class SparseWriter(io.BufferedWriter):
 
 def sync(path: Path) -> None:
     """
+    Flush a file or folder to the disk.
+
     :param path: a file or folder, what is in it is on the disk when this returns (Windows cannot do so with folders)
     """
     if path.is_dir() and os.name == "nt":
@@ -236,6 +244,8 @@ def sync(path: Path) -> None:
 
 def checkpoints(folder: Path) -> list[Path]:
     """
+    List the complete checkpoints of a folder.
+
     :param folder: of a ``ResumableCheckpoint``
     :return: those in it that got their name, which is a number, the newest first; a folder with nothing of one is none
     """
@@ -247,11 +257,14 @@ def checkpoints(folder: Path) -> list[Path]:
 
 
 def is_number(name: str) -> bool:
+    """Tell whether the name of a folder is a number."""
     return name.isascii() and name.isdecimal()
 
 
 def newest_checkpoint(folder: Path) -> Path | None:
     """
+    Find the newest complete checkpoint.
+
     :param folder: of a ``ResumableCheckpoint``
     :return: the newest complete one in it, None if there is none
     """
@@ -260,6 +273,8 @@ def newest_checkpoint(folder: Path) -> Path | None:
 
 def sound_checkpoint(folder: Path) -> tuple[Path | None, list[str]]:
     """
+    Find the newest checkpoint that is not damaged.
+
     :param folder: of a ``ResumableCheckpoint``
     :return: the newest one in it that a training can go on from, None if there is none; and what is wrong with newer ones
     """
@@ -302,6 +317,8 @@ def verify(folder: Path) -> None:
 
 def verify_model(model: Path) -> dict[str, Any]:
     """
+    Check the file of a model.
+
     :param model: saved by SB3
     :return: its attributes, as JSON holds them
     :raises DamagedCheckpoint: if it is damaged, or a weight is not finite
@@ -324,6 +341,8 @@ def verify_model(model: Path) -> dict[str, Any]:
 
 def is_finite(values: Any) -> bool:
     """
+    Tell whether all numbers are finite.
+
     :param values: a tensor, or lists and dictionaries of them
     """
     if isinstance(values, th.Tensor):
@@ -334,6 +353,8 @@ def is_finite(values: Any) -> bool:
 
 def verify_buffer(path: Path, written: dict[str, Any]) -> None:
     """
+    Check the file of a replay buffer without unpickling it.
+
     :param path: of a replay buffer; it is not unpickled
     :param written: its size and checksum, if they are known
     :raises DamagedCheckpoint: if it is missing or damaged
@@ -348,6 +369,8 @@ def verify_buffer(path: Path, written: dict[str, Any]) -> None:
 
 def checksum(path: Path) -> tuple[int, bytes]:
     """
+    Compute the checksum of a file.
+
     :return: that of a file, and its last byte
     """
     crc, last = 0, b""
@@ -359,6 +382,8 @@ def checksum(path: Path) -> tuple[int, bytes]:
 
 def stored_rows(folder: Path) -> int | None:
     """
+    Read how many rows the replay buffer of a checkpoint has.
+
     :param folder: of a checkpoint
     :return: rows of its replay buffer, None if it has none or is too old to say
     """
@@ -368,6 +393,8 @@ def stored_rows(folder: Path) -> int | None:
 
 def checkpoint_step(model: str | Path) -> int | None:
     """
+    Read at which step a checkpoint was written.
+
     :param model: path of a saved model
     :return: number of steps that were made if it is that of a ``ResumableCheckpoint``, else None
     """

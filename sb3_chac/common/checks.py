@@ -23,6 +23,8 @@ class MismatchedParameters(ValueError, RuntimeError):
 
 def check_action_space(action_space: spaces.Space) -> None:
     """
+    Check that actions are bounded.
+
     :raises UnsupportedActionSpace: unless ``action_space`` is a Box with finite bounds, low < high
     """
     if not isinstance(action_space, spaces.Box):
@@ -40,6 +42,8 @@ def check_action_space(action_space: spaces.Space) -> None:
 
 def check_driving_action(action: Any) -> None:
     """
+    Check the action of a driving task.
+
     :param action: [steering, acceleration], handed to an environment
     :raises ValueError: unless it is two finite numbers
     """
@@ -56,6 +60,8 @@ def check_driving_action(action: Any) -> None:
 
 def check_range(name: str, value: Any, low: float = -math.inf, high: float = math.inf, exclusive_low: bool = False) -> None:
     """
+    Check the range of a number.
+
     :param name: name of the argument, for the message
     :param value: a number
     :param exclusive_low: whether ``low`` itself is refused
@@ -70,6 +76,8 @@ def check_range(name: str, value: Any, low: float = -math.inf, high: float = mat
 
 def check_integer(name: str, value: Any, low: int) -> None:
     """
+    Check an integer.
+
     :raises ValueError: unless ``value`` is an integer of at least ``low``
     """
     if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < low:
@@ -92,6 +100,8 @@ def check_learning_rate(name: str, value: float | Callable[[float], float]) -> N
 
 def is_finite(values: Any) -> bool:
     """
+    Tell whether numbers are finite.
+
     :param values: a number or an array of any kind
     :return: whether none is NaN, infinite, or too large for the 32 bits that numbers are stored in
     """
@@ -101,6 +111,8 @@ def is_finite(values: Any) -> bool:
 
 def number_in(info: dict[str, Any], key: str, env_idx: int) -> float | None:
     """
+    Read an optional number from ``info``.
+
     :param info: of one step
     :return: the number under ``key``, None if there is none: it is not measured
     :raises ValueError: if it is no finite number
@@ -124,6 +136,8 @@ def check_step(
     observations: np.ndarray | dict[str, np.ndarray], rewards: np.ndarray, infos: list[dict[str, Any]], step: int
 ) -> None:
     """
+    Check that all numbers of a step are finite.
+
     :param observations: what followed, shape (n_envs, ...), or a dictionary of such arrays
     :param rewards: shape (n_envs,)
     :param infos: with the terminal observations and costs, if there are any
@@ -140,6 +154,8 @@ def check_step(
 
 def check_reset(observations: np.ndarray | dict[str, np.ndarray], normalize: VecNormalize | None, step: int) -> None:
     """
+    Check that all numbers of first observations are finite.
+
     :param observations: that episodes begin with, shape (n_envs, ...), or a dictionary of such arrays
     :param normalize: of the environments, if there is one: normalizing clips what is infinite
     :param step: total number of steps so far, for the message
@@ -152,6 +168,8 @@ def check_reset(observations: np.ndarray | dict[str, np.ndarray], normalize: Vec
 
 def check_finite(name: str, values: np.ndarray | dict[str, np.ndarray], step: int, env_idx: int | None = None) -> None:
     """
+    Check that numbers are finite.
+
     :param name: what the values are ("observation", "reward"), for the message
     :param values: shape (n_envs, ...), or a dictionary of such arrays
     :param step: total number of steps so far, for the message

@@ -77,6 +77,8 @@ def read_report(info: dict[str, Any], action_space: spaces.Space, env_idx: int =
 
 def _first(info: dict[str, Any], keys: Sequence[str]) -> tuple[str, Any] | None:
     """
+    Find the first key that has a value.
+
     :return: the first of the keys whose value is there and not None, with it. LeRobot's keys are members of an Enum
     """
     named = {key.value if isinstance(key, Enum) else key: value for key, value in info.items()}
@@ -89,6 +91,8 @@ def _truth(value: Any) -> bool:
 
 def scaled(action: np.ndarray, action_space: spaces.Space, env_idx: int) -> np.ndarray:
     """
+    Scale the human's action.
+
     :param action: the human's, in the units of ``action_space``, a Box with finite bounds
     :return: scaled to [-1, 1], of the same shape
     :raises ValueError: if it is outside of the bounds
@@ -106,6 +110,8 @@ def scaled(action: np.ndarray, action_space: spaces.Space, env_idx: int) -> np.n
 
 def changed_action(env_idx: int, sent: np.ndarray, received: np.ndarray) -> ValueError:
     """
+    Make the error for an action that was changed on its way.
+
     :param sent: by the algorithm
     :param received: where the human takes over
     """
@@ -124,6 +130,8 @@ class TakeoverWrapper(gym.Wrapper):
 
     def sb3_chac_takeovers(self, method: str, *args: Any) -> Any:
         """
+        Call a method of this wrapper by its name.
+
         :param method: of this wrapper
         :return: what it returns
         """
@@ -133,21 +141,29 @@ class TakeoverWrapper(gym.Wrapper):
 
     def takeover_budget(self) -> int | None:
         """
+        Return the human's budget.
+
         :return: how many steps the human drives at most
         """
         return self.budget
 
     def takeover_space(self) -> spaces.Space:
         """
+        Return the space of the actions that are replaced in a takeover.
+
         :return: the space of the actions that are replaced in a takeover
         """
         return self.action_space
 
 
 class TakeoverDisplay:
-    """Base of environments whose pictures show what wrappers want to have shown (``hud``: name -> value)."""
+    """
+    Base of environments whose pictures show what wrappers want to have shown (``hud``: name -> value), in a box of numbers
+    unless ``panel`` is False: then whoever shows the picture shows them beside it.
+    """
 
     hud: dict[str, Any]
+    panel: bool = True
 
 
 class _ActionWrapperAboveTakeover(type):
@@ -168,6 +184,8 @@ class ActionWrapperAboveTakeover(metaclass=_ActionWrapperAboveTakeover):
 
 def action_wrapper_above_report(env: gym.Env) -> gym.Wrapper | None:
     """
+    Find a wrapper that changes actions above the one that reports takeovers.
+
     :param env: reports takeovers, somewhere among its wrappers
     :return: the wrapper that changes actions above all that may report them (what overrides ``step``), None if there is none
     """
@@ -192,6 +210,8 @@ class _ReportsBelow:
 
 def check_reports(env: "VecEnv", idx: int) -> None:
     """
+    Check the units of reported actions.
+
     :param env: training environments
     :param idx: of one that reports a takeover
     :raises UnsupportedActionSpace: if one can see that it does so in other units than those of the algorithm
@@ -207,6 +227,8 @@ def check_reports(env: "VecEnv", idx: int) -> None:
 
 def check_report_order(env: gym.Env) -> None:
     """
+    Check the units of the actions that an environment reports.
+
     :param env: reports takeovers, somewhere among its wrappers
     :raises UnsupportedActionSpace: if what it reports is not in the units of its action space
     """
@@ -225,6 +247,8 @@ def _wrong_order(takeover_space: spaces.Space | str, action_space: spaces.Space,
 
 def check_takeover_order(env: gym.Env) -> None:
     """
+    Check that no wrapper changes actions above a takeover.
+
     :param env: an environment, with its wrappers
     :raises UnsupportedActionSpace: if one of them changes actions above a ``TakeoverWrapper``
     """
@@ -237,6 +261,8 @@ def check_takeover_order(env: gym.Env) -> None:
 
 def wrapped_indices(env: "VecEnv") -> list[int]:
     """
+    Find the environments with a ``TakeoverWrapper``.
+
     :return: indices of the environments that have a ``TakeoverWrapper``
     """
     return [idx for idx, wrapped in enumerate(env.env_is_wrapped(TakeoverWrapper)) if wrapped]
@@ -244,6 +270,8 @@ def wrapped_indices(env: "VecEnv") -> list[int]:
 
 def ask_wrappers(env: "VecEnv", indices: Sequence[int], method: str, *args: Any) -> list[Any]:
     """
+    Call a method of the ``TakeoverWrapper`` of some environments.
+
     :param indices: of environments that have a ``TakeoverWrapper``
     :param method: of it
     :return: what each returns
@@ -253,6 +281,8 @@ def ask_wrappers(env: "VecEnv", indices: Sequence[int], method: str, *args: Any)
 
 def check_order(env: "VecEnv") -> None:
     """
+    Check that no wrapper of the training environments changes actions above a takeover.
+
     :param env: training environments
     :raises UnsupportedActionSpace: if actions are changed between the algorithm and the takeover
     """

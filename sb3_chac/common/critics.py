@@ -66,6 +66,8 @@ class DistributionalCritic(BaseModel):
 
     def forward(self, obs: PyTorchObs, actions: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """
+        Compute mean and standard deviation of the return.
+
         :param obs: batch of observations
         :param actions: scaled to [-1, 1], shape (batch_size, action_dim)
         :return: Q and sigma, both of shape (n_critics, batch_size)

@@ -40,6 +40,8 @@ class DatasetError(ValueError):
 
 def missing_dataset(algorithm: str) -> DatasetError:
     """
+    Make the error for an algorithm without a dataset.
+
     :param algorithm: name of the class
     """
     return DatasetError(
@@ -99,6 +101,8 @@ def load_demonstrations(
     action_space: spaces.Space | None = None,
 ) -> Demonstrations:
     """
+    Load demonstrations as flat arrays.
+
     :param dataset: id of a dataset among the local ones of Minari ("safedrive/scripted-v0"), its folder, a ``MinariDataset``
         (filtered, too), or what was loaded before; or a list of these, one after the other. It may have been recorded by
         others, with ``minari.DataCollector``
@@ -144,6 +148,8 @@ def load_demonstrations(
 
 def joined(parts: Sequence[Demonstrations]) -> Demonstrations:
     """
+    Concatenate demonstrations.
+
     :param parts: at least one
     :return: all their episodes, one after the other; what is not recorded in each of them is left out, but for who drove:
         where it is not told, the human drove all of it
@@ -174,6 +180,8 @@ def joined(parts: Sequence[Demonstrations]) -> Demonstrations:
 
 def is_minari_dataset(dataset: Any) -> bool:
     """
+    Tell Minari's datasets from others, without importing Minari.
+
     :return: whether it is a ``MinariDataset``
     """
     from minari import MinariDataset
@@ -183,6 +191,8 @@ def is_minari_dataset(dataset: Any) -> bool:
 
 def open_dataset(dataset: "str | os.PathLike[str] | MinariDataset") -> "MinariDataset":
     """
+    Open a dataset with Minari.
+
     :param dataset: id of a local dataset of Minari, its folder, or what was opened before
     :raises DatasetError: if it is missing, damaged, empty, or made by a version of Minari that the installed one cannot read
     """
@@ -208,6 +218,8 @@ def open_dataset(dataset: "str | os.PathLike[str] | MinariDataset") -> "MinariDa
 
 def check_version(folder: Path, name: str) -> None:
     """
+    Check that Minari can read a dataset.
+
     :param folder: that holds the data
     :param name: of the dataset, for the message
     :raises DatasetError: if the installed Minari cannot read what another version has written
@@ -228,6 +240,8 @@ def check_version(folder: Path, name: str) -> None:
 
 def find_dataset(dataset: str | os.PathLike[str]) -> Path:
     """
+    Find the folder of a dataset.
+
     :param dataset: id of a local dataset of Minari, or its folder
     :return: the folder that holds the data
     :raises DatasetError: if there is none
@@ -247,6 +261,8 @@ def find_dataset(dataset: str | os.PathLike[str]) -> Path:
 
 def minari_folder() -> Path:
     """
+    Return Minari's folder of datasets, which need not exist yet.
+
     :return: where Minari keeps its datasets. It need not exist yet
     """
     return Path(os.environ.get("MINARI_DATASETS_PATH") or Path.home() / ".minari" / "datasets")
@@ -254,6 +270,8 @@ def minari_folder() -> Path:
 
 def is_dataset_id(name: str) -> bool:
     """
+    Tell whether a name is an id of Minari.
+
     :return: whether it is an id such as "safedrive/scripted-v0", with a version at its end
     """
     from minari.dataset.minari_dataset import parse_dataset_id
@@ -267,6 +285,8 @@ def is_dataset_id(name: str) -> bool:
 
 def check_spaces(observation_space: spaces.Space, action_space: spaces.Space) -> None:
     """
+    Check that a dataset can hold the spaces.
+
     :raises DatasetError: unless observations are a Box and actions a Box or Discrete
     """
     if not isinstance(observation_space, spaces.Box):
@@ -280,6 +300,8 @@ def check_spaces(observation_space: spaces.Space, action_space: spaces.Space) ->
 
 def space_difference(found: spaces.Space, expected: spaces.Space) -> str:
     """
+    Word the difference between two spaces.
+
     :return: what differs in ``found``, to follow "differs in", or "" if nothing does
     """
     if not (isinstance(found, spaces.Box) and isinstance(expected, spaces.Box)):
@@ -301,6 +323,8 @@ def space_difference(found: spaces.Space, expected: spaces.Space) -> str:
 
 def _read(dataset: "MinariDataset") -> Demonstrations:
     """
+    Read the episodes of a dataset.
+
     :raises Exception: of any kind, for a damaged one
     """
     episodes = list(dataset.storage.get_episodes(dataset.episode_indices))
@@ -333,6 +357,8 @@ def _read(dataset: "MinariDataset") -> Demonstrations:
 
 def _joined_infos(episodes: Sequence[dict[str, Any]], lengths: Sequence[int], key: str) -> np.ndarray | None:
     """
+    Concatenate an entry of the infos.
+
     :return: the values that belong to the actions, None unless every episode has one for each
     """
     infos = [np.asarray((episode["infos"] or {}).get(key)) for episode in episodes]
@@ -343,6 +369,8 @@ def _joined_infos(episodes: Sequence[dict[str, Any]], lengths: Sequence[int], ke
 
 def _check_arrays(demonstrations: Demonstrations, name: str) -> None:
     """
+    Check shapes, bounds and finiteness.
+
     :raises DatasetError: unless there is at least one step, all arrays have the shape that their space asks for, all numbers
         are finite and all actions within their bounds
     """

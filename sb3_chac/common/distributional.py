@@ -18,8 +18,10 @@ def gaussian_surrogate_loss(
     epsilon: float = 0.1,
 ) -> th.Tensor:
     """
-    Per-sample surrogate of the Gaussian negative log-likelihood, as in DSAC-T (Duan et al. 2023, arXiv 2310.05858,
-    "three refinements"; C-HAC's critic loss). Only its gradient means something, its value does not:
+    Compute the per-sample surrogate of the Gaussian negative log-likelihood, C-HAC's critic loss.
+
+    It is that of DSAC-T (Duan et al. 2023, arXiv 2310.05858, "three refinements"). Only its gradient means something, its
+    value does not:
 
         d/dQ     = -(b^2 + e) (y_q - Q) / (sigma^2 + e)
         d/dsigma = -(b^2 + e) (d^2 - eta sigma^2) / (sigma^3 + e),      d = clip(y_z - Q, -c b, c b)

@@ -12,12 +12,12 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
-from stable_baselines3.common.utils import safe_mean
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_chac.common import contract
 from sb3_chac.common.buffers import DualReplayBuffer
 from sb3_chac.common.checks import check_action_space, check_reset, number_in
+from sb3_chac.common.costs import EpisodeCosts, record_costs
 from sb3_chac.common.demonstrations import Dataset, load_demonstrations
 from sb3_chac.common.off_policy_algorithm import CheckedOffPolicyAlgorithm
 
@@ -117,9 +117,14 @@ class GuidedOffPolicyAlgorithm(CheckedOffPolicyAlgorithm):
         return wrapped
 
     def _forget_episodes(self) -> None:
-        self.episode_costs = np.zeros(self.n_envs)
+        self.episode_costs = EpisodeCosts(self.n_envs)
         self.human_driving = np.zeros(self.n_envs, dtype=bool)
         self._events_last = np.zeros((self.n_envs, len(LASTING)), dtype=bool)
+
+    @property
+    def safety_cost(self) -> float | None:
+        """Sum of ``info["cost"]`` since the start of the training, None as long as no environment has reported any."""
+        return self.counts["safety_cost"] if "safety_cost" in self.measured else None
 
     def _needs_human(self) -> bool:
         """Whether the human is asked in this stage of the training."""
@@ -219,6 +224,8 @@ class GuidedOffPolicyAlgorithm(CheckedOffPolicyAlgorithm):
 
     def _announce_step(self) -> list[tuple[int, int]]:
         """
+        Announce the next step to the wrappers.
+
         :return: numbers of steps and resets by others since the last one, of each wrapped environment
         """
         may_drive = self._may_drive()
@@ -228,6 +235,8 @@ class GuidedOffPolicyAlgorithm(CheckedOffPolicyAlgorithm):
 
     def _may_drive(self) -> list[int]:
         """
+        Share the rest of the budget.
+
         :return: indices of the environments whose human may drive the next step without exceeding the budget
         """
         if self._budget is None:
@@ -300,6 +309,8 @@ class GuidedOffPolicyAlgorithm(CheckedOffPolicyAlgorithm):
 
     def _check_received(self, idx: int, info: dict[str, Any], sent: np.ndarray) -> None:
         """
+        Check that an action arrived as it was sent.
+
         :param sent: scaled to [-1, 1]
         :raises ValueError: if another action arrived where the human takes over than the one that was sent
         """
@@ -323,22 +334,22 @@ class GuidedOffPolicyAlgorithm(CheckedOffPolicyAlgorithm):
                 self.measured |= {"safety_cost", "safety_cost_human"}
                 counts["safety_cost"] += info["cost"]
                 counts["safety_cost_human"] += info["cost"] * takeover
-                self.episode_costs[idx] += info["cost"]
             for name, keys in EVENTS.items():
                 key = next((key for key in keys if info.get(key) is not None), None)
                 if key is not None:
                     self.measured.add(name)
                     counts[name] += self._happens(idx, key, bool(info[key]), bool(done))
-            if done:
-                if "safety_cost" in self.measured:
-                    self.ep_cost_buffer.append(self.episode_costs[idx])
-                self.episode_costs[idx] = 0.0
+        finished = self.episode_costs.add([info["cost"] for info in infos], dones)
+        if self.safety_cost is not None:
+            self.ep_cost_buffer.extend(finished)
         if self._wrapped:
             names = ("human_steps", "total_steps")
             self._note_wrapper_states({idx: {name: infos[idx][name] for name in names} for idx in self._wrapped})
 
     def _happens(self, idx: int, key: str, value: bool, done: bool) -> bool:
         """
+        Tell whether an event begins.
+
         :return: whether an event begins that ``info[key]`` tells of
         """
         if key not in LASTING:
@@ -352,11 +363,10 @@ class GuidedOffPolicyAlgorithm(CheckedOffPolicyAlgorithm):
         for name in ("human_steps", "total_steps", "takeovers", "takeover_cost"):
             self.logger.record(f"takeover/{name}", counts[name])
         self.logger.record("takeover/rate", counts["human_steps"] / max(counts["total_steps"], 1))
-        for name in ("safety_cost", "safety_cost_human", "collisions", "departures"):
+        for name in ("safety_cost_human", "collisions", "departures"):
             if name in self.measured:  # else it would look like a zero
                 self.logger.record(f"safety/{name}", counts[name])
-        if self.ep_cost_buffer:
-            self.logger.record("rollout/ep_cost_mean", safe_mean(self.ep_cost_buffer))
+        record_costs(self.logger, self.safety_cost, self.ep_cost_buffer)
         super().dump_logs()
 
     def _excluded_save_params(self) -> list[str]:

@@ -9,36 +9,16 @@ import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import MaybeCallback
-from stable_baselines3.common.utils import safe_mean
 from torch import nn
 
-from sb3_chac.common.checks import check_integer, check_range, is_finite
-
-
-def step_costs(infos: list[dict[str, Any]]) -> np.ndarray:
-    """
-    :param infos: of one step, one per environment
-    :return: their ``info["cost"]``, shape (n_envs,)
-    :raises ValueError: if one has none, or none that is a finite number
-    """
-    costs = np.zeros(len(infos))
-    for idx, info in enumerate(infos):
-        try:
-            costs[idx] = float(info["cost"])
-        except (KeyError, TypeError, ValueError):
-            costs[idx] = math.nan
-        if not is_finite(costs[idx]):
-            raise ValueError(
-                f"info['cost'] of environment {idx} must be a finite number at every step, got {info.get('cost', 'none')!r}: "
-                "take an environment that reports its safety cost (SafeDrive-v0 does), or wrap this one to put it there. "
-                "Nothing of this step was stored; the model can still be saved."
-            )
-    return costs
+from sb3_chac.common.checks import check_integer, check_range
+from sb3_chac.common.costs import EpisodeCosts, record_costs, step_costs
 
 
 class PIDLagrangian(nn.Module):
     """
     Lagrange multiplier of the constraint "the mean cost of an episode is at most ``cost_limit``", moved by a PID controller.
+
     Paper: "Responsive Safety in Reinforcement Learning by PID Lagrangian Methods" (Stooke et al. 2020),
     https://arxiv.org/abs/2007.03964
 
@@ -103,6 +83,8 @@ class PIDLagrangian(nn.Module):
 
     def update(self, episode_cost: float) -> float:
         """
+        Update the multiplier.
+
         :param episode_cost: J
         :return: the new multiplier, also ``value``
         """
@@ -127,7 +109,7 @@ def constrained_actor_loss(
     log_prob: th.Tensor, q_values: th.Tensor, cost_q_values: th.Tensor, ent_coef: th.Tensor | float, multiplier: float
 ) -> th.Tensor:
     """
-    ``mean[ (alpha log pi - min Q + lambda max Q_c) / (1 + lambda) ]``
+    Compute the actor's loss ``mean[ (alpha log pi - min Q + lambda max Q_c) / (1 + lambda) ]``.
 
     :param log_prob: log pi of the actor's actions, shape (batch_size,)
     :param q_values: of the reward's critics for these actions, shape (batch_size, n_critics)
@@ -142,7 +124,7 @@ def constrained_actor_loss(
 
 def constrained_advantages(advantages: th.Tensor, cost_advantages: th.Tensor, multiplier: float, normalize: bool) -> th.Tensor:
     """
-    ``(A_r - lambda A_c) / (1 + lambda)``
+    Combine the advantages of reward and cost, ``(A_r - lambda A_c) / (1 + lambda)``.
 
     :param advantages: A_r, of the reward, shape (batch_size,)
     :param cost_advantages: A_c, of the cost, shape (batch_size,)
@@ -180,7 +162,7 @@ class CostConstrainedAlgorithm(BaseAlgorithm):
         pid_delay: int,
     ) -> None:
         """
-        The arguments of the constructor that are about costs: those of ``PIDLagrangian``, and
+        Store the arguments of the constructor that are about costs: those of ``PIDLagrangian`` and ``cost_gamma``.
 
         :param cost_gamma: discount factor of costs; ``gamma`` if None
         """
@@ -216,7 +198,7 @@ class CostConstrainedAlgorithm(BaseAlgorithm):
         if not hasattr(self, "ep_cost_buffer"):  # else it was loaded
             self.ep_cost_buffer: deque[float] = deque(maxlen=self._stats_window_size)
             self.safety_cost = 0.0
-        self.episode_costs = np.zeros(self.n_envs)
+        self.episode_costs = EpisodeCosts(self.n_envs)
 
     @property
     def cost_discount(self) -> float:
@@ -234,11 +216,13 @@ class CostConstrainedAlgorithm(BaseAlgorithm):
         if reset_num_timesteps:
             self.ep_cost_buffer.clear()
         if reset_num_timesteps or self._last_obs is None:  # the environments are about to be reset
-            self.episode_costs = np.zeros(self.n_envs)
+            self.episode_costs = EpisodeCosts(self.n_envs)
         return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
 
     def _count_costs(self, infos: list[dict[str, Any]], dones: np.ndarray) -> tuple[np.ndarray, list[float]]:
         """
+        Count the costs of one step.
+
         :param infos: of one step
         :param dones: shape (n_envs,)
         :return: costs of this step, shape (n_envs,), and those of the episodes that end with it
@@ -246,17 +230,12 @@ class CostConstrainedAlgorithm(BaseAlgorithm):
         """
         costs = step_costs(infos)
         self.safety_cost += float(costs.sum())
-        self.episode_costs += costs
-        is_over = dones.astype(bool)
-        finished = self.episode_costs[is_over].tolist()
-        self.episode_costs[is_over] = 0.0
+        finished = self.episode_costs.add(costs, dones)
         self.ep_cost_buffer.extend(finished)
         return costs, finished
 
     def _record_costs(self) -> None:
-        self.logger.record("safety/safety_cost", self.safety_cost)
-        if self.ep_cost_buffer:
-            self.logger.record("rollout/ep_cost_mean", safe_mean(self.ep_cost_buffer))
+        record_costs(self.logger, self.safety_cost, self.ep_cost_buffer)
 
     def _record_multiplier(self) -> None:
         self.logger.record("train/lagrange_multiplier", self.multiplier.value)

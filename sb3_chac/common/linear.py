@@ -71,6 +71,8 @@ class OneDnnLinearFunction(th.autograd.Function):
 
 def linear(inputs: th.Tensor, weight: th.Tensor, bias: th.Tensor) -> th.Tensor:
     """
+    Apply a linear layer.
+
     :param inputs: shape (batch_size, in_features)
     :param weight: shape (out_features, in_features)
     :param bias: shape (out_features,)
@@ -107,6 +109,8 @@ class StackedLinear(nn.Module):
 
     def forward(self, inputs: th.Tensor) -> th.Tensor:
         """
+        Apply all layers of the stack.
+
         :param inputs: shape (n_stack, batch_size, in_features), or (batch_size, in_features) for all layers alike
         :return: shape (n_stack, batch_size, out_features)
         """

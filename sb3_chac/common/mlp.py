@@ -102,6 +102,8 @@ class MLPFunction(th.autograd.Function):
 
 def _networks(parameters: tuple[th.Tensor, ...]) -> list[list[tuple[th.Tensor, th.Tensor]]]:
     """
+    Collect the layers of each network.
+
     :return: weight and bias of each layer, for each network of the stack
     """
     layers = list(zip(parameters[::2], parameters[1::2], strict=True))
@@ -119,6 +121,8 @@ class FastMLP(nn.Sequential):
 
     def forward(self, features: th.Tensor, actions: th.Tensor | None = None) -> th.Tensor:
         """
+        Evaluate the network or the stack of networks.
+
         :param features: shape (batch_size, n_features)
         :param actions: shape (batch_size, n_actions), to follow the features
         :return: shape (batch_size, n_outputs); of a stack (n_stack, batch_size, n_outputs)

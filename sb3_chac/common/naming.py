@@ -21,6 +21,8 @@ def import_named(module: str) -> ModuleType:
 
 def is_name(value: Any) -> bool:
     """
+    Tell whether a value names something that can be imported.
+
     :return: whether ``value`` has the form "package.module:function"
     """
     if not isinstance(value, str):

@@ -1,3 +1,5 @@
+"""Checks for off-policy algorithms."""
+
 import io
 import pathlib
 from typing import Any, ClassVar

@@ -73,6 +73,8 @@ class DatasetSampler:
 
     def draw(self) -> np.ndarray:
         """
+        Draw a batch of steps.
+
         :return: indices of steps, shape (batch_size,); a pass ends where the next batch would not be full
         """
         if self.position + self.batch_size > len(self.order):
@@ -177,6 +179,8 @@ class OfflineAlgorithm(BaseAlgorithm):
 
     def set_dataset(self, dataset: Dataset | None) -> None:
         """
+        Set the dataset.
+
         :param dataset: to learn from, from now on
         :raises DatasetError: if there is none, or it does not fit
         """
@@ -214,6 +218,8 @@ class OfflineAlgorithm(BaseAlgorithm):
         progress_bar: bool = False,
     ) -> SelfOffline:
         """
+        Learn from the dataset.
+
         :param total_timesteps: number of gradient steps
         :param callback: called after each gradient step, each of which counts as a rollout
         :param log_interval: number of gradient steps between two logs
@@ -262,12 +268,16 @@ class OfflineAlgorithm(BaseAlgorithm):
 
     def _gradient_step(self, batch: Batch) -> dict[str, th.Tensor]:
         """
+        Make one gradient step.
+
         :return: what to log, scalars
         """
         raise NotImplementedError
 
     def _batch(self, indices: np.ndarray) -> Batch:
         """
+        Gather a batch from the dataset.
+
         :param indices: of steps of the dataset, shape (batch_size,)
         """
         data = self._demonstrations
@@ -292,6 +302,8 @@ class OfflineAlgorithm(BaseAlgorithm):
 
     def _dump_logs(self, stats: defaultdict[str, list[th.Tensor]]) -> None:
         """
+        Log the means since the last time.
+
         :param stats: since the last time, is emptied
         """
         assert self._sampler is not None

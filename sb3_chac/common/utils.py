@@ -47,6 +47,8 @@ class TargetUpdate:
 
     def __call__(self, tau: float) -> None:
         """
+        Update all targets.
+
         :param tau: the soft update coefficient, between 0 and 1
         """
         polyak_update(self.params, self.target_params, tau)
@@ -93,6 +95,8 @@ class FixedStatistics(RunningMeanStd):
 
 def fix_statistics(normalize: VecNormalize | None, observations: np.ndarray) -> None:
     """
+    Fix the statistics of a normalization to those of a dataset.
+
     :param normalize: of an environment; if it is in training, it normalizes by the statistics of ``observations`` from now on
     :param observations: that a model is about to be fitted to, not normalized, shape (n, *observation_shape)
     """
@@ -158,6 +162,8 @@ def safe_log(value: float) -> float:
 
 def initial_ent_coef(ent_coef: str | float) -> float:
     """
+    Parse the entropy coefficient.
+
     :param ent_coef: the argument of an algorithm
     :return: alpha at the start: 1 for 'auto', x for 'auto_x' and for the number x
     :raises ValueError: for anything else

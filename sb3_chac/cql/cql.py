@@ -1,3 +1,5 @@
+"""Conservative Q-learning (CQL)."""
+
 import math
 from typing import Any, ClassVar, TypeVar
 
@@ -233,6 +235,8 @@ class CQL(OfflineAlgorithm):
     @th.no_grad()
     def _q_targets(self, batch: Batch, ent_coef: th.Tensor) -> th.Tensor:
         """
+        Compute the targets of the critics.
+
         :return: shape (batch_size,)
         """
         next_actions, next_log_prob = self.actor.action_log_prob(batch.next_observations)
@@ -243,6 +247,8 @@ class CQL(OfflineAlgorithm):
 
     def _sampled_q_values(self, batch: Batch) -> tuple[th.Tensor, th.Tensor]:
         """
+        Evaluate the critics at sampled actions.
+
         :return: Q(s, b) for N actions each drawn uniformly, from the actor in s and from the actor in s', shape
             (n_critics, batch_size, 3 N), and the log densities that they were drawn with, shape (batch_size, 3 N)
         """
@@ -262,6 +268,8 @@ class CQL(OfflineAlgorithm):
 
     def _draw_actions(self, observations: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """
+        Draw actions of the actor.
+
         :return: actions of shape (batch_size, N, action_dim) and their log densities, shape (batch_size, N)
         """
         parameters = self.actor.get_action_dist_params(observations)[:2]

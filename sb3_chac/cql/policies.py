@@ -1,3 +1,5 @@
+"""Policies of CQL."""
+
 import torch as th
 from stable_baselines3.common.policies import ContinuousCritic
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor

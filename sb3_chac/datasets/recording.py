@@ -155,6 +155,8 @@ class Recorder(Runner):
 
     def record(self, number: int) -> "EpisodeBuffer":
         """
+        Record one episode.
+
         :param number: of the episode, from 0
         :return: the episode as Minari stores it, the infos of an action at the index of what followed it
         """
@@ -199,6 +201,8 @@ class Recorder(Runner):
 
     def _executed(self, proposed: Any, info: dict[str, Any]) -> Any:
         """
+        Find the executed action.
+
         :return: what was executed instead of ``proposed`` if the human took over
         :raises ValueError: if that is not in the units of the action space, as far as one can see
         """
@@ -214,6 +218,8 @@ class Recorder(Runner):
 
     def _stacked_infos(self, proposals: list[Any], told: list[dict[str, Any]]) -> dict[str, np.ndarray]:
         """
+        Collect the infos of an episode.
+
         :param proposals: what the driver proposed, at each step
         :param told: ``info`` of each step
         :return: per key zero for the reset, then what a dataset holds of each step; zero where one does not tell
@@ -226,6 +232,8 @@ class Recorder(Runner):
 
     def _in_space(self, action: Any) -> Any:
         """
+        Copy an action in the dtype of its space.
+
         :return: a copy, in the dtype of the action space: what is executed is what is stored
         """
         space = self.env.action_space
@@ -236,6 +244,8 @@ class Recorder(Runner):
         action: Any, info: dict[str, Any], action_space: spaces.Space, someone_watches: bool = False
     ) -> dict[str, Any]:
         """
+        Select the entries of a step's ``info`` that are stored.
+
         :param action: what the novice proposed, if there is one
         :param info: of the step
         :param action_space: of the environment
@@ -255,6 +265,8 @@ class Recorder(Runner):
 
 def recorded_episodes(recorder: Recorder, jobs: int) -> Generator["EpisodeBuffer"]:
     """
+    Record episodes, in parallel processes if wanted.
+
     :return: endless, in the order of the numbers; to be closed
     """
     if jobs == 1:

@@ -46,6 +46,8 @@ class Replay(Runner):
 
     def episode(self, number: int, on_step: Callable[[], None] = lambda: None) -> tuple[dict[str, Any], None]:
         """
+        Repeat the recorded actions.
+
         :param number: of the episode
         :param on_step: called after the reset and after each step
         :return: number, return and steps; see ``report`` for how they differ from those recorded
@@ -65,6 +67,8 @@ class Replay(Runner):
 
     def report(self) -> str:
         """
+        Word how the replay differs from the recording.
+
         :return: how what happened differs from what was recorded, to read
         """
         steps, recorded_steps = len(self.rewards), len(self.recorded.rewards)

@@ -63,6 +63,8 @@ class DatasetWriter:
 
     def finish(self) -> None:
         """
+        Complete the dataset and give it its name.
+
         :raises DatasetError: if a dataset of that name has come into being in the meantime
         """
         dataset_id = dataset_id_of(self.folder)
@@ -88,6 +90,8 @@ class DatasetWriter:
 
 def folder_to_make(dataset: str | os.PathLike[str], overwrite: bool) -> Path:
     """
+    Find the folder of a dataset that is to be made.
+
     :param dataset: id for Minari's folder, or the folder to make: an absolute one, or one that begins with "."
     :return: the folder of the dataset
     :raises DatasetError: for a name that Minari does not take, or one that is taken
@@ -103,6 +107,8 @@ def folder_to_make(dataset: str | os.PathLike[str], overwrite: bool) -> Path:
 
 def check_free(folder: Path, overwrite: bool) -> None:
     """
+    Check that a folder may be written.
+
     :raises DatasetError: if the folder is there, unless it is a dataset that may be overwritten
     """
     if not folder.exists():
@@ -115,6 +121,8 @@ def check_free(folder: Path, overwrite: bool) -> None:
 
 def dataset_id_of(folder: Path) -> str:
     """
+    Return the id of a dataset.
+
     :return: the id under which Minari finds the dataset, or the name of its folder if it is kept elsewhere
     """
     root = minari_folder().absolute()
@@ -132,6 +140,8 @@ def make_namespace(dataset_id: str) -> None:
 
 def storable_spec(env: gym.Env) -> EnvSpec | None:
     """
+    Describe how to make an environment again.
+
     :return: how to make the environment again, without those who take over; None if that cannot be written down
     """
     spec = env.spec
@@ -148,6 +158,8 @@ def storable_spec(env: gym.Env) -> EnvSpec | None:
 
 def versions() -> dict[str, str]:
     """
+    Collect the versions of the packages that matter for a recording.
+
     :return: of the packages that have a say in what is recorded
     """
     names = ("stable_baselines3", "gymnasium", "numpy", "minari")

@@ -22,7 +22,7 @@ from sb3_chac.chac.policies import CONTROLS, CHACPolicy
 from sb3_chac.common.checks import check_action_space
 from sb3_chac.deploy.metadata import KEY, Input, Metadata, NotDeployable
 from sb3_chac.deploy.policy import OnnxPolicy
-from sb3_chac.evaluate import check_output, parse_env_kwargs
+from sb3_chac.evaluation.arguments import check_output, parse_env_kwargs
 from sb3_chac.evaluation.episodes import ModelDriver, NotEvaluable, make_env
 from sb3_chac.evaluation.evaluation import scenario_list
 from sb3_chac.evaluation.models import env_of, find_algorithm, find_normalization, load_model
@@ -74,6 +74,8 @@ class Deployable(nn.Module):
 
     def forward(self, *tensors: th.Tensor) -> tuple[th.Tensor, ...]:
         """
+        Compute actions.
+
         :param tensors: of the raw observation, shape (batch_size, ...) each
         :return: actions; of shared control also the guided policy's actions, who drives and the confidence
         """
@@ -196,6 +198,8 @@ def export(
 
 def spaces_of(space: spaces.Space) -> dict[str, spaces.Space]:
     """
+    Split a space into its parts.
+
     :return: the parts of a Dict space, or the space itself under ""
     :raises NotDeployable: for spaces within spaces
     """
@@ -334,6 +338,8 @@ def make_parser() -> argparse.ArgumentParser:
 
 def main(arguments: list[str]) -> None:
     """
+    Run the command.
+
     :param arguments: of the command line, after ``export``
     """
     parser = make_parser()
@@ -349,6 +355,8 @@ def main(arguments: list[str]) -> None:
 
 def run(args: argparse.Namespace) -> bool:
     """
+    Export a model and compare it with its graph.
+
     :param args: see ``make_parser``
     :return: whether the file acts as the model does, as far as that was checked
     :raises FileNotFoundError: if the model, or the folder of the file, does not exist

@@ -1,3 +1,5 @@
+"""Distributional proxy value propagation (D-PVP)."""
+
 from sb3_chac.dpvp.dpvp import DPVP
 from sb3_chac.dpvp.policies import CnnPolicy, MlpPolicy, MultiInputPolicy
 

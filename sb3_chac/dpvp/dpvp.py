@@ -1,3 +1,5 @@
+"""Distributional proxy value propagation (D-PVP)."""
+
 import io
 import pathlib
 import warnings
@@ -246,6 +248,8 @@ class DPVP(GuidedOffPolicyAlgorithm, DSAC):
 
     def _label_losses(self, q_values: th.Tensor, stds: th.Tensor, label: float) -> th.Tensor:
         """
+        Compute the loss of the proxy values.
+
         :return: loss of each critic and sample against a fixed target, shape of ``q_values``
         """
         target = th.full_like(q_values, label)

@@ -1,3 +1,5 @@
+"""Policies of D-PVP."""
+
 from typing import Any, ClassVar
 
 import torch as th
@@ -10,8 +12,9 @@ from sb3_chac.dsac.policies import DSACPolicy
 
 class DPVPPolicy(DSACPolicy):
     """
-    ``DSACPolicy`` and an average of the actor's parameters over time, which acts when ``deterministic``. The parameters are
-    those of ``DSACPolicy``, but for the default of:
+    ``DSACPolicy`` and an average of the actor's parameters over time, which acts when ``deterministic``.
+
+    The parameters are those of ``DSACPolicy``, but for the default of ``optimizer_class``.
 
     :param optimizer_class: Optimizer of the actor and the critics; AdamW, whose ``weight_decay`` the algorithm sets
     """

@@ -1,3 +1,5 @@
+"""Distributional soft actor-critic (DSAC)."""
+
 from collections import defaultdict
 from collections.abc import Callable
 from typing import Any, ClassVar, TypeVar
@@ -214,6 +216,8 @@ class DSAC(CheckedOffPolicyAlgorithm):
 
     def _current_ent_coef(self) -> th.Tensor:
         """
+        Return the entropy coefficient.
+
         :return: alpha, shape (1,)
         """
         return self.ent_coef_tensor if self.log_ent_coef is None else self.log_ent_coef.detach().exp()
@@ -267,6 +271,8 @@ class DSAC(CheckedOffPolicyAlgorithm):
 
     def _gradient_step(self, batch: Any) -> dict[str, th.Tensor]:
         """
+        Make one gradient step.
+
         :param batch: from the replay buffer
         :return: what to log, scalars
         """
@@ -297,6 +303,8 @@ class DSAC(CheckedOffPolicyAlgorithm):
         self, actor_target: Actor, critic_target: DistributionalCritic, batch: Any, rewards: th.Tensor, ent_coef: th.Tensor
     ) -> tuple[th.Tensor, th.Tensor]:
         """
+        Compute the mean and the sampled target of the return.
+
         :return: y_q and y_z with a' from ``actor_target``, both of shape (batch_size,)
         """
         next_actions, next_log_prob = actor_target.action_log_prob(batch.next_observations)
@@ -312,6 +320,8 @@ class DSAC(CheckedOffPolicyAlgorithm):
         self, critic: DistributionalCritic, batch: Any, targets: tuple[th.Tensor, th.Tensor], eta: float | None = None
     ) -> tuple[th.Tensor, tuple[th.Tensor, th.Tensor], dict[str, th.Tensor]]:
         """
+        Compute the losses of the critics.
+
         :return: losses of shape (n_critics, batch_size), (Q, sigma) of the same shape, and what to log
         """
         q_values, stds = critic(batch.observations, batch.actions)

@@ -1,3 +1,5 @@
+"""Policies of DSAC."""
+
 from typing import Any, ClassVar
 
 import torch as th

@@ -16,3 +16,6 @@ ONE_PER_PROCESS = {"MetaDriveSafety-v0"}
 for _name, _entry_point in ENVIRONMENTS.items():
     if _name not in registry:
         register(_name, entry_point=_entry_point)
+# For rehearsals (no maps for validation, no hyperparameters of its own)
+if "RoadTest-v0" not in registry:
+    register("RoadTest-v0", entry_point="sb3_chac.envs.roadtest:RoadTestEnv")

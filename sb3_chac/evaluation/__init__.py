@@ -1,3 +1,5 @@
+"""Evaluation of policies on held-out scenarios."""
+
 from sb3_chac.evaluation.episodes import NotEvaluable
 from sb3_chac.evaluation.evaluation import Evaluation, compare, evaluate, scenario_list
 

@@ -70,6 +70,8 @@ def join_curves(first: Curves, second: Curves) -> Curves:
 
 def over_human_steps(curves: Curves) -> Curves:
     """
+    Change the x axis to the human's steps.
+
     :return: the same values over the steps that the human has driven; nothing where no human drove
     """
     human = curves.get(HUMAN_STEPS)
@@ -104,6 +106,8 @@ def mean_and_interval(curves: Sequence[Curve]) -> tuple[np.ndarray, np.ndarray, 
 
 def style(number: int) -> tuple[str, str]:
     """
+    Choose how a method is drawn.
+
     :return: colour and line style of a method, no two alike among the first 32
     """
     return COLOURS[number % len(COLOURS)], LINES[(number + number // len(COLOURS)) % len(LINES)]
@@ -169,6 +173,8 @@ def draw(methods: Sequence[Method], quantities: Iterable[str], over_human: bool 
 
 def final(run: Curves, quantity: str) -> float:
     """
+    Take the value at the end of a run.
+
     :return: mean of the last ``LAST`` evaluations, or the last value of what is a sum; NaN if there is none
     """
     curve = run.get(quantity, np.empty((0, 2)))
@@ -179,6 +185,8 @@ def final(run: Curves, quantity: str) -> float:
 
 def finals(method: Method, quantity: str) -> np.ndarray:
     """
+    Take the values at the end of all runs.
+
     :return: of the runs that have it, shape (n,)
     """
     values = np.array([final(run, quantity) for run in method.runs])
@@ -187,6 +195,8 @@ def finals(method: Method, quantity: str) -> np.ndarray:
 
 def interquartile_mean(values: np.ndarray) -> Score | None:
     """
+    Average the middle half of the values.
+
     :param values: one for each run, shape (n,)
     :return: None without values
     """
@@ -222,6 +232,8 @@ def probability_of_improvement(better: np.ndarray, worse: np.ndarray) -> Score |
 
 def _estimate(scores: np.ndarray | tuple[np.ndarray, np.ndarray], function: Callable[..., np.ndarray]) -> tuple[float, ...]:
     """
+    Estimate the interquartile mean.
+
     :return: value, and the ends of its 95 % stratified bootstrap interval
     """
     from rliable.library import get_interval_estimates
@@ -244,6 +256,8 @@ COLUMNS = {RETURN: 1, SUCCESS: 2, COST: 2, TRAINING_COST: 0, HUMAN_STEPS: 0}  # 
 
 def summary(methods: Sequence[Method]) -> Table:
     """
+    Tabulate the ends of all methods.
+
     :return: a row for each method: seeds, steps, and interquartile means with intervals
     """
     names = [name for name in COLUMNS if any(len(finals(method, name)) for method in methods)]
@@ -259,6 +273,8 @@ def summary(methods: Sequence[Method]) -> Table:
 
 def improvements(methods: Sequence[Method], quantity: str = RETURN) -> Table:
     """
+    Tabulate how often one method ends above another.
+
     :return: probability that a run of the row's method ends above one of the column's
     """
     cells = [["" for _ in methods] for _ in methods]
@@ -273,12 +289,15 @@ def improvements(methods: Sequence[Method], quantity: str = RETURN) -> Table:
 
 
 def markdown(table: Table) -> str:
+    """Write a table as Markdown."""
     head, *rows = (f"| {' | '.join(row)} |" for row in table)
     return "\n".join([head, "|---" * len(table[0]) + "|", *rows])
 
 
 def latex(table: Table) -> str:
     """
+    Write a table as LaTeX.
+
     :return: a tabular with the rules of the package booktabs
     """
     escapes = {"\\": r"\textbackslash{}", **{c: f"\\{c}" for c in "&%$#_{}"}, "±": r"$\pm$"}

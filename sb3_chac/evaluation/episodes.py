@@ -48,6 +48,8 @@ class DrivenPath(NamedTuple):
 
 def make_env(env: str | EnvSpec | Callable[..., gym.Env], env_kwargs: dict[str, Any]) -> gym.Env:
     """
+    Make an environment.
+
     :raises NotEvaluable: if there is no such environment, or it does not take ``env_kwargs``
     """
     try:
@@ -86,6 +88,8 @@ PATH_OF_CODE = re.compile(r"[^\W\d]\w*(?:\s*[.:]+\s*[^\W\d]\w*)+")
 
 def check_names_no_code(value: Any, known: EnvSpec, source: str) -> None:
     """
+    Check that keywords from a file name no code of other packages.
+
     :param value: that a file gives to an environment: keywords, or options of a reset
     :param known: the registered specification; its own package may be named
     :param source: the file, for the message
@@ -125,6 +129,8 @@ class SavedModel(NamedTuple):
 
     def load(self, env: gym.Env) -> BaseAlgorithm:
         """
+        Load the model for acting.
+
         :param env: its spaces must be the model's; HER does not load without one
         :return: the model, on the CPU, fit for acting only
         """
@@ -242,12 +248,16 @@ class Runner:
 
     def seed(self, number: int) -> int:
         """
+        Derive the seed of an episode.
+
         :return: seed of one episode, from the task's seed and the number of the episode alone
         """
         return int(np.random.SeedSequence([self.task.seed, number]).generate_state(1)[0])
 
     def reset(self, number: int) -> Any:
         """
+        Begin an episode.
+
         :param number: scenario, or episode if the task has no scenarios
         :return: first observation
         """
@@ -259,6 +269,8 @@ class Runner:
 
     def episode(self, number: int, on_step: Callable[[], None] = lambda: None) -> tuple[dict[str, Any], DrivenPath | None]:
         """
+        Run one episode.
+
         :param number: scenario, or episode if the task has no scenarios
         :param on_step: called after the reset and after each step
         :return: record and driven path, see ``Evaluation``
@@ -307,6 +319,8 @@ class Runner:
 
 def _scalars(info: dict[str, Any]) -> dict[str, Any]:
     """
+    Select the scalars of an info.
+
     :return: the numbers, truth values and texts in ``info``, as Python's own types, without NaN and infinity
     """
     values = {str(key): value.item() if isinstance(value, np.generic) else value for key, value in info.items()}

@@ -51,6 +51,8 @@ class Evaluation:
 
     def summary(self) -> dict[str, float]:
         """
+        Sum up the episodes.
+
         :return: number of episodes, mean and standard deviation over the episodes of all that every episode reports
         """
         result: dict[str, float] = {"episodes": len(self.records)}
@@ -64,6 +66,8 @@ class Evaluation:
 
     def table(self) -> str:
         """
+        Word the summary.
+
         :return: the summary to read, a line per number
         """
         summary = self.summary()
@@ -77,12 +81,16 @@ class Evaluation:
 
     def to_dict(self) -> dict[str, Any]:
         """
+        Collect summary, settings and records.
+
         :return: summary, settings and records; what an episode does not have is left out
         """
         return {**self.summary(), **self.settings, "records": self.records}
 
     def to_json(self) -> str:
         """
+        Write ``to_dict`` as JSON.
+
         :return: ``to_dict`` as strict JSON (no NaN)
         """
         return json.dumps(self.to_dict(), indent=2, allow_nan=False, default=repr)
@@ -164,6 +172,8 @@ def policy_name(policy: BaseAlgorithm | str | Callable[[Any], Any]) -> str:
 
 def compare(evaluations: list[Evaluation]) -> str:
     """
+    Compare evaluations in a table.
+
     :param evaluations: on the same episodes
     :return: a table to read, a line per policy
     """
@@ -187,6 +197,8 @@ def compare(evaluations: list[Evaluation]) -> str:
 
 def scenario_list(scenarios: Iterable[int] | str) -> list[int]:
     """
+    Parse scenarios.
+
     :param scenarios: numbers, or text: "1000:1050" (1050 itself excluded), "1000" or "1000,1003:1010"
     :raises ValueError: if there is none, one is negative or occurs twice, or the text is malformed
     """
@@ -228,6 +240,8 @@ def _episodes(runner: Runner, numbers: list[int], jobs: int) -> Iterator[tuple[d
 
 def saved_model(model: BaseAlgorithm) -> SavedModel:
     """
+    Save a model for another process.
+
     :return: the model in a form that can be sent to another process
     """
     archive = io.BytesIO()

@@ -23,6 +23,8 @@ DEFAULT_ENV = "SafeDrive-v0"
 
 def env_of(model: Path | None) -> str:
     """
+    Guess the environment of a model from its path.
+
     :param model: a file such as logs/chac/SafeDrive-v0_1/best_model.zip or chac-SafeDrive-v0.zip
     :return: the first of our environments whose name occurs in that of the file or of its folder, else ``DEFAULT_ENV``
     """
@@ -32,6 +34,8 @@ def env_of(model: Path | None) -> str:
 
 def find_algorithm(path: Path, algo: str | None) -> tuple[Path, str, type[BaseAlgorithm]]:
     """
+    Find the algorithm of a saved model.
+
     :param path: a saved model, with or without ".zip"
     :param algo: name of the algorithm, read from the file if None: the module of the model's policy and the arguments stored
         with it tell, and the path where they do not
@@ -59,6 +63,8 @@ def find_algorithm(path: Path, algo: str | None) -> tuple[Path, str, type[BaseAl
 
 def guess_algorithm(path: Path, module: str, stored: set[str], algorithms: dict[str, type[BaseAlgorithm]]) -> str:
     """
+    Guess the algorithm of a saved model.
+
     :param path: of the saved model, e.g. logs/<algo>/<env>_1/<env>.zip or <algo>-<env>.zip
     :param module: the one that defines its policy
     :param stored: names of the attributes stored with it
@@ -95,6 +101,8 @@ def load_model(
     path: Path, algo: str, algorithm: type[BaseAlgorithm], env: gym.Env, control: str | None = None
 ) -> BaseAlgorithm:
     """
+    Load a saved model for acting.
+
     :param algo: name of the algorithm, for the message
     :param algorithm: its class
     :param env: the environment that the model is to act in
@@ -133,6 +141,8 @@ def remedy_for(path: Path, env: gym.Env) -> str:
 
 def find_normalization(model: Path, env_id: str, env: gym.Env) -> tuple[Path, VecNormalize | None]:
     """
+    Find the statistics of a model's observations.
+
     :param env: that the model fits
     :return: where RL-Zoo3 leaves the statistics of a model's observations, and the VecNormalize there, None if there is none
     :raises NotEvaluable: if the file cannot be read

@@ -21,6 +21,8 @@ COLOURS = {True: ("tab:green", "success"), False: ("tab:red", "no success"), Non
 
 def check_can_render(runner: Runner) -> None:
     """
+    Check that an environment can render images.
+
     :raises NotEvaluable: unless the environment can render images
     """
     modes = runner.env.metadata.get("render_modes") or []
@@ -30,6 +32,8 @@ def check_can_render(runner: Runner) -> None:
 
 def check_has(runner: Runner, number: int, *names: str) -> None:
     """
+    Check that an environment can tell positions or draw its map.
+
     :param number: scenario, or episode if there are no scenarios, to start: environments may have no position before
     :param names: what the environment must have: "position" to say where the vehicle is, "plot_map" to draw its map
     :raises NotEvaluable: unless it has
@@ -94,6 +98,8 @@ def save_plot(file: Path, runner: Runner, evaluation: Evaluation) -> None:
 
 def _plot_path(axes: Axes, runner: Runner, number: int, record: dict, path: DrivenPath) -> None:
     """
+    Draw one driven path on its map.
+
     :param number: scenario, or episode if there are no scenarios
     """
     runner.reset(number)

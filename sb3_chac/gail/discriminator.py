@@ -1,3 +1,5 @@
+"""The discriminator of GAIL."""
+
 from typing import Any
 
 import numpy as np
@@ -69,6 +71,8 @@ class Discriminator(nn.Module):
 
     def inputs(self, observations: th.Tensor, actions: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """
+        Prepare observations and actions for the network.
+
         :param observations: shape (batch_size, *observation_shape)
         :param actions: in the units of a Box, shape (batch_size, *action_shape); numbers from 0 on if they are discrete, shape
             (batch_size,)
@@ -86,6 +90,8 @@ class Discriminator(nn.Module):
 
     def forward(self, observations: th.Tensor, actions: th.Tensor) -> th.Tensor:
         """
+        Compute the logits.
+
         :param observations: from ``inputs``
         :param actions: from ``inputs``
         :return: logits of D, shape (batch_size,)
@@ -95,6 +101,8 @@ class Discriminator(nn.Module):
 
 def imitation_rewards(logits: th.Tensor) -> th.Tensor:
     """
+    Compute the rewards of imitation.
+
     :param logits: of D, any shape
     :return: ``-log(1 - D)``, above 0: the more the expert would have done so, the greater
     """
@@ -103,6 +111,8 @@ def imitation_rewards(logits: th.Tensor) -> th.Tensor:
 
 def discriminator_loss(expert_logits: th.Tensor, policy_logits: th.Tensor) -> th.Tensor:
     """
+    Compute the loss of the discriminator.
+
     :param expert_logits: shape (batch_size,)
     :param policy_logits: shape (batch_size,)
     :return: ``-(mean log D(expert) + mean log(1 - D(policy))) / 2``

@@ -1,3 +1,5 @@
+"""Generative adversarial imitation learning (GAIL)."""
+
 from collections import defaultdict
 from typing import Any, ClassVar, TypeVar
 
@@ -178,6 +180,8 @@ class GAIL(CheckedRollouts, PPO):
 
     def _check_arguments(self) -> None:
         """
+        Check the arguments.
+
         :raises ValueError: names the argument and the remedy
         """
         check_policy_kwargs("policy_kwargs", self.policy_class, self.policy_kwargs, ("pi", "vf"))
@@ -197,6 +201,8 @@ class GAIL(CheckedRollouts, PPO):
 
     def set_dataset(self, dataset: Dataset | None) -> None:
         """
+        Set the dataset.
+
         :param dataset: to imitate from now on
         :raises DatasetError: if there is none, or it does not fit
         """
@@ -270,6 +276,8 @@ class GAIL(CheckedRollouts, PPO):
 
     def _penalty(self, expert: tuple[th.Tensor, th.Tensor], policy: tuple[th.Tensor, th.Tensor]) -> th.Tensor:
         """
+        Compute the gradient penalty.
+
         :param expert: inputs of the discriminator
         :param policy: likewise, as many
         :return: (norm of the gradient of the logit - 1)^2, its mean over random points between the two
@@ -285,6 +293,8 @@ class GAIL(CheckedRollouts, PPO):
 
     def _logits(self, observations: th.Tensor, actions: th.Tensor) -> th.Tensor:
         """
+        Evaluate the discriminator.
+
         :return: of D, in parts of the size that training has, shape (n,)
         """
         parts = zip(observations.split(self.disc_batch_size), actions.split(self.disc_batch_size), strict=True)
@@ -292,6 +302,8 @@ class GAIL(CheckedRollouts, PPO):
 
     def _rollout_inputs(self) -> tuple[th.Tensor, th.Tensor]:
         """
+        Collect the steps of the rollout.
+
         :return: observations and actions (as the environment gets them) of the rollout, before it is shuffled, shape
             (n_steps * n_envs, ...)
         """
@@ -305,6 +317,8 @@ class GAIL(CheckedRollouts, PPO):
 
     def _expert_inputs(self, rows: np.ndarray) -> tuple[th.Tensor, th.Tensor]:
         """
+        Collect steps of the demonstrations.
+
         :param rows: steps of the demonstrations
         :return: inputs of the discriminator
         """

@@ -1,3 +1,5 @@
+"""Human-gated DAgger (HG-DAgger)."""
+
 import math
 import warnings
 from typing import Any, ClassVar, TypeVar
@@ -268,6 +270,8 @@ class HGDagger(GuidedOffPolicyAlgorithm):
 
     def _training_set(self) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
         """
+        Collect the data to learn from.
+
         :return: observations, shape (n, *observation_shape); executed actions scaled to [-1, 1], shape (n, action_dim); and
             the probability with which each is drawn, shape (n,), None for shuffled passes
         """
@@ -283,6 +287,8 @@ class HGDagger(GuidedOffPolicyAlgorithm):
         progress_bar: bool = False,
     ) -> SelfHGDagger:
         """
+        Learn from takeovers, round after round.
+
         :param total_timesteps: number of steps of the environments at most, see above
         """
         return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
@@ -296,6 +302,8 @@ class HGDagger(GuidedOffPolicyAlgorithm):
 
 def filled(store: TransitionStore) -> tuple[np.ndarray, np.ndarray]:
     """
+    Collect the rows of a store.
+
     :return: observations and executed actions of all rows
     """
     return store.arrays["observation/"][: len(store)], store.arrays["action"][: len(store)]
@@ -303,6 +311,8 @@ def filled(store: TransitionStore) -> tuple[np.ndarray, np.ndarray]:
 
 def evaluate_now(callback: BaseCallback) -> None:
     """
+    Trigger the evaluations among callbacks.
+
     :param callback: those that evaluate, also inside others, do so now, whatever their frequency
     """
     if isinstance(callback, EvalCallback) and callback.eval_freq > 0:

@@ -29,6 +29,8 @@ class Expert(Protocol):
 
     def __call__(self, observation: Any) -> np.ndarray:
         """
+        Act.
+
         :param observation: what the environment returned last, one environment's, not batched
         :return: the action in the units of the environment, of the shape of its action space
         """
@@ -81,6 +83,8 @@ class ModelExpert:
 
 def within(seconds: float | None, function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
     """
+    Call a function with a deadline.
+
     :param seconds: that the function has, None for as long as it needs
     :return: what it returns
     :raises TimeoutError: if it is late; its thread is left to itself
@@ -107,6 +111,8 @@ def within(seconds: float | None, function: Callable[..., Any], *args: Any, **kw
 
 def make_expert(expert: Any, env: gym.Env) -> Expert:
     """
+    Make an expert of a name, a model or a function.
+
     :param expert: a name of a scripted driver that ``env`` has ("scripted", "scripted-ideal"), a loaded model (anything
         with SB3's ``predict``), an ``Expert``, a function observation -> action, or "package.module:name", which names one of
         these or a class, of which ``env`` gets an object of its own: ``Class(env)``
@@ -166,6 +172,8 @@ def check_expert(expert: Any, env: gym.Env) -> None:
 
 def expert_name(expert: Any) -> str:
     """
+    Name an expert for a message.
+
     :return: what to call ``expert`` in a message
     """
     if isinstance(expert, str):

@@ -1,3 +1,5 @@
+"""The wrapper in which an expert takes over from the novice."""
+
 import copy
 from enum import StrEnum
 from typing import Any
@@ -308,6 +310,8 @@ class InterventionWrapper(contract.TakeoverWrapper, RecordConstructorArgs):
 
     def set_stage(self, stage: str | int) -> None:
         """
+        Set the stage that is displayed.
+
         :param stage: stage of the training, for the display
         """
         self._stage = stage
@@ -329,12 +333,16 @@ class InterventionWrapper(contract.TakeoverWrapper, RecordConstructorArgs):
 
     def state_dict(self) -> dict[str, int]:
         """
+        Return the counts.
+
         :return: the counts, to go on with the same budget after a restart
         """
         return {"human_steps": self._human_steps, "total_steps": self._total_steps}
 
     def load_state_dict(self, state_dict: dict[str, int]) -> None:
         """
+        Restore the counts.
+
         :param state_dict: from ``state_dict``
         :raises ValueError: unless it holds the two counts
         """
@@ -379,6 +387,8 @@ class InterventionWrapper(contract.TakeoverWrapper, RecordConstructorArgs):
 
     def _ask_expert(self, observation: Any) -> np.ndarray:
         """
+        Ask the expert for an action and check it.
+
         :return: the expert's action, within the bounds and of the dtype of the action space
         """
         assert self._expert is not None

@@ -25,6 +25,8 @@ class TakeoverRule(Protocol):
 
     def __call__(self, observation: Any, novice_action: np.ndarray, expert_action: np.ndarray, human_driving: bool) -> bool:
         """
+        Decide whether the human drives this step.
+
         :param observation: what the environment returned last
         :param novice_action: in the units of the environment
         :param expert_action: in the units of the environment
@@ -160,6 +162,8 @@ def never(observation: Any, novice_action: np.ndarray, expert_action: np.ndarray
 
 def scale_action(action: np.ndarray, action_space: spaces.Box) -> np.ndarray:
     """
+    Scale an action.
+
     :param action: in the units of the environment
     :param action_space: a Box with finite bounds
     :return: ``action`` with the bounds mapped to -1 and 1, in float64
@@ -170,6 +174,8 @@ def scale_action(action: np.ndarray, action_space: spaces.Box) -> np.ndarray:
 
 def make_rule(rule: Any, env: gym.Env, expert: Any, rule_kwargs: dict[str, Any] | None = None) -> TakeoverRule:
     """
+    Make a rule of a name or a function.
+
     :param rule: "risk" (``RiskRule`` with the expert's predictor), "disagreement" (``DisagreementRule`` with threshold 0.3),
         "always", "never", a ``TakeoverRule`` (of a ``RiskRule`` each environment gets its own copy), a function
         (observation, novice action, expert action) -> bool, or "package.module:name", which names one of these or a class, of

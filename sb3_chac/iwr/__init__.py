@@ -1,3 +1,5 @@
+"""Intervention weighted regression (IWR)."""
+
 from sb3_chac.bc.policies import CnnPolicy, MlpPolicy
 from sb3_chac.iwr.iwr import IWR
 

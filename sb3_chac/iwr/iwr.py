@@ -1,3 +1,5 @@
+"""Intervention weighted regression (IWR)."""
+
 from typing import TypeVar
 
 import numpy as np
@@ -41,6 +43,8 @@ class IWR(HGDagger):
 
 def class_weights(is_human: np.ndarray) -> np.ndarray:
     """
+    Weight both classes equally.
+
     :param is_human: shape (n,), bool
     :return: probability of each sample, shape (n,): both classes sum up to 1/2; equal for all if one of them is empty
     """

@@ -1,3 +1,5 @@
+"""Policies of PPO-Lag, with a value function of the cost."""
+
 from functools import partial
 
 import numpy as np
@@ -31,6 +33,8 @@ class CostActorCriticPolicy(ActorCriticPolicy):
 
     def predict_cost_values(self, obs: PyTorchObs) -> th.Tensor:
         """
+        Predict the costs to come.
+
         :param obs: batch of observations
         :return: discounted costs to come, shape (batch_size, 1)
         """

@@ -1,3 +1,5 @@
+"""PPO with a Lagrange multiplier on the safety cost (PPO-Lag)."""
+
 from collections import defaultdict
 from typing import Any, ClassVar, TypeVar
 
@@ -185,6 +187,8 @@ class PPOLag(CostConstrainedAlgorithm, CheckedRollouts, PPO):
 
     def _check_arguments(self) -> None:
         """
+        Check the arguments.
+
         :raises ValueError: names the argument and the remedy
         """
         if not issubclass(self.policy_class, CostActorCriticPolicy):
@@ -221,6 +225,8 @@ class PPOLag(CostConstrainedAlgorithm, CheckedRollouts, PPO):
     @th.no_grad()
     def _cost_values(self) -> th.Tensor:
         """
+        Predict the costs to come in the current states.
+
         :return: cost values of where the environments are, shape (n_envs, 1)
         """
         return self.policy.predict_cost_values(obs_as_tensor(self._last_obs, self.device))  # type: ignore[arg-type]
@@ -292,6 +298,8 @@ class PPOLag(CostConstrainedAlgorithm, CheckedRollouts, PPO):
 
     def _loss(self, batch: CostRolloutBufferSamples) -> tuple[th.Tensor, dict[str, th.Tensor]]:
         """
+        Compute the loss of a minibatch.
+
         :return: PPO's loss, with that of the cost's value function, and what to log, scalars
         """
         # Convert discrete action from float to long

@@ -1,3 +1,5 @@
+"""Proxy value propagation (PVP)."""
+
 from typing import Any, TypeVar
 
 import torch as th

@@ -10,7 +10,7 @@ from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer
 from stable_baselines3.common.type_aliases import TensorDict
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_chac.common.lagrange import step_costs
+from sb3_chac.common.costs import step_costs
 
 
 class CostReplayBufferSamples(NamedTuple):
@@ -57,6 +57,8 @@ class CostReplayBuffer(ReplayBuffer):
 
     def _of_costs(self) -> Any:
         """
+        View the buffer as one of costs.
+
         :return: a copy that shares all arrays, with costs in place of rewards
         """
         of_costs = copy.copy(self)
@@ -77,7 +79,9 @@ class CostDictReplayBuffer(CostReplayBuffer, DictReplayBuffer):
 
 class CostNStepReplayBuffer(CostReplayBuffer, NStepReplayBuffer):
     """
-    ``CostReplayBuffer`` of n-step returns. The parameters are those of SB3's ``NStepReplayBuffer``, and:
+    ``CostReplayBuffer`` of n-step returns.
+
+    The parameters are those of SB3's ``NStepReplayBuffer``, and ``cost_gamma``.
 
     :param cost_gamma: discount factor of costs
     """
@@ -94,6 +98,8 @@ class CostNStepReplayBuffer(CostReplayBuffer, NStepReplayBuffer):
 
 def default_buffer_class(observation_space: spaces.Space, n_steps: int) -> type[CostReplayBuffer]:
     """
+    Choose the replay buffer.
+
     :param n_steps: number of rewards in a return
     :return: the buffer for these observations
     :raises ValueError: for Dict observations and ``n_steps`` above 1

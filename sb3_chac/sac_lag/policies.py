@@ -1,3 +1,5 @@
+"""Policies of SAC-Lag, with critics of the cost."""
+
 from stable_baselines3.common.policies import ContinuousCritic
 from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.sac import policies as sac

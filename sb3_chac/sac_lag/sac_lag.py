@@ -1,3 +1,5 @@
+"""SAC with a Lagrange multiplier on the safety cost (SAC-Lag)."""
+
 import io
 import pathlib
 import warnings
@@ -293,6 +295,8 @@ class SACLag(CostConstrainedAlgorithm, CheckedOffPolicyAlgorithm, SAC):
 
     def _update_ent_coef(self, log_prob: th.Tensor) -> th.Tensor:
         """
+        Update the entropy coefficient.
+
         :param log_prob: log pi of the actor's actions, shape (batch_size,)
         :return: alpha before the update
         """
@@ -315,6 +319,8 @@ class SACLag(CostConstrainedAlgorithm, CheckedOffPolicyAlgorithm, SAC):
     @th.no_grad()
     def _targets(self, batch: CostReplayBufferSamples, ent_coef: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """
+        Compute the targets of return and cost.
+
         :return: y and y_c, both of shape (batch_size, 1)
         """
         next_actions, next_log_prob = self.actor.action_log_prob(batch.next_observations)

@@ -1,27 +1,13 @@
-"""The table of our algorithms: names on the command line, classes and hyperparameters."""
+"""Our algorithms by their names on the command line (the table is ``sb3_chac.ALGORITHMS``), and their hyperparameters."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import sb3_chac
+from sb3_chac import ALGORITHMS
 
 if TYPE_CHECKING:
     from sb3_chac.common.guided import GuidedOffPolicyAlgorithm
-
-# Names on RL-Zoo3's command line -> public class
-ALGORITHMS = {
-    "dsac": "DSAC",
-    "pvp": "PVP",
-    "dpvp": "DPVP",
-    "chac": "CHAC",
-    "sac_lag": "SACLag",
-    "ppo_lag": "PPOLag",
-    "bc": "BC",
-    "cql": "CQL",
-    "gail": "GAIL",
-    "hg_dagger": "HGDagger",
-    "iwr": "IWR",
-}
 
 
 def hyperparams_file(algo: str) -> Path:

@@ -34,6 +34,8 @@ NOISES = ("normal", "ornstein-uhlenbeck")
 @contextmanager
 def one_line(*kinds: type[Exception]) -> Iterator[None]:
     """
+    End the process with one line for an error inside the block.
+
     :param kinds: of errors that end the process with one line inside the block
     """
     try:
@@ -50,6 +52,8 @@ def one_line(*kinds: type[Exception]) -> Iterator[None]:
 
 def check_options(args: Any) -> None:
     """
+    Check the options of the command line.
+
     :param args: of ``rl_zoo3 train``
     :raises ValueError: names the option that is out of its range
     """
@@ -69,6 +73,7 @@ def check_options(args: Any) -> None:
 
 
 def is_module(name: str) -> bool:
+    """Return whether there is a Python module of this name."""
     try:
         return importlib.util.find_spec(name) is not None
     except (ImportError, ValueError):
@@ -77,6 +82,8 @@ def is_module(name: str) -> bool:
 
 def check_file(config: str, env_id: str) -> None:
     """
+    Check a hyperparameters file.
+
     :param config: hyperparameters file of RL-Zoo3
     :param env_id: of the environment
     :raises ValueError: if it is not a mapping of environments to mappings, or holds none for this one
@@ -96,6 +103,8 @@ def check_file(config: str, env_id: str) -> None:
 
 def check_hyperparameters(hyperparams: dict[str, Any], n_timesteps: int) -> None:
     """
+    Check the hyperparameters of RL-Zoo3.
+
     :param hyperparams: of RL-Zoo3, before it takes its own out
     :param n_timesteps: of the command line, which win if they are positive
     :raises ValueError: names the one that is no number, or out of its range
@@ -129,6 +138,8 @@ def check_hyperparameters(hyperparams: dict[str, Any], n_timesteps: int) -> None
 @contextmanager
 def evaluating(hyperparams: dict[str, Any]) -> Iterator[None]:
     """
+    Name hyperparameters that cannot be evaluated as Python.
+
     :param hyperparams: that RL-Zoo3 evaluates inside the block, if they are text
     :raises ValueError: names those that may not be Python
     """
@@ -140,6 +151,7 @@ def evaluating(hyperparams: dict[str, Any]) -> Iterator[None]:
 
 
 def is_a_number(text: str) -> bool:
+    """Tell whether a text is a finite number."""
     try:
         return math.isfinite(float(text))
     except ValueError:
@@ -147,11 +159,14 @@ def is_a_number(text: str) -> bool:
 
 
 def is_whole(value: Any) -> bool:
+    """Tell whether a value is a finite whole number, of any type."""
     return isinstance(value, int | float) and math.isfinite(value) and value == int(value)
 
 
 def store_dict(original: Callable[..., None]) -> Callable[..., None]:
     """
+    Wrap RL-Zoo3's parser of pairs, so that its errors name the option.
+
     :param original: ``__call__`` of RL-Zoo3's ``StoreDict``
     :return: the same, whose error names the option and the pair
     """

@@ -76,6 +76,8 @@ def init(original: Callable[..., None], manager: Any, *args: Any, **kwargs: Any)
 
 def init_ours(original: Callable[..., None], manager: Any, algo: str, arguments: dict[str, Any]) -> None:
     """
+    Set up an experiment with our algorithms or environments.
+
     :param arguments: of RL-Zoo3's ``__init__``
     """
     if not arguments.get("config"):
@@ -94,6 +96,8 @@ def init_ours(original: Callable[..., None], manager: Any, algo: str, arguments:
 
 def is_ours(manager: Any) -> bool:
     """
+    Tell whether an experiment concerns this package.
+
     :return: whether the algorithm or the environment is one of this package
     """
     return manager.algo in ALGORITHMS or manager.env_name.gym_id in ENVIRONMENTS
@@ -101,6 +105,8 @@ def is_ours(manager: Any) -> bool:
 
 def one_line_of(manager: Any, *kinds: type[Exception]) -> contextlib.AbstractContextManager[None]:
     """
+    Choose how errors are told.
+
     :return: see ``one_line``; nothing for those who tell errors themselves
     """
     return contextlib.nullcontext() if getattr(manager, "tells_errors", False) else one_line(*kinds)
@@ -195,6 +201,8 @@ def learn(original: Callable[..., None], manager: Any, model: Any) -> None:
 
 def learn_ours(original: Callable[..., None], manager: Any, model: Any) -> None:
     """
+    Learn with checkpoints and signals.
+
     :param original: RL-Zoo3's ``learn``
     """
     if manager.steps_done is not None:
@@ -215,6 +223,8 @@ def learn_ours(original: Callable[..., None], manager: Any, model: Any) -> None:
 
 def go_on(original: Callable[..., None], manager: Any, model: Any) -> None:
     """
+    Go on from a checkpoint.
+
     :param original: RL-Zoo3's ``learn``
     :param model: of a checkpoint
     :raises DamagedCheckpoint: if the replay buffer is not the one that belongs to it

@@ -15,6 +15,8 @@ from rl_zoo3.hyperparams_opt import (
 
 def sample_dsac_params(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> dict[str, Any]:
     """
+    Sample hyperparameters of DSAC.
+
     :param trial: the trial to suggest values in
     :param n_actions: number of actions
     :param n_envs: number of parallel environments
@@ -40,6 +42,8 @@ def sample_dsac_params(trial: optuna.Trial, n_actions: int, n_envs: int, additio
 
 def sample_pvp_params(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> dict[str, Any]:
     """
+    Sample hyperparameters of PVP.
+
     :return: keyword arguments of PVP. For the parameters see ``sample_dsac_params``
     """
     return convert_offpolicy_params(_suggest_guided(trial))
@@ -47,6 +51,8 @@ def sample_pvp_params(trial: optuna.Trial, n_actions: int, n_envs: int, addition
 
 def sample_dpvp_params(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> dict[str, Any]:
     """
+    Sample hyperparameters of D-PVP.
+
     :return: keyword arguments of DPVP. For the parameters see ``sample_dsac_params``
     """
     return convert_offpolicy_params(_suggest_dpvp(trial))
@@ -70,6 +76,8 @@ def sample_chac_params(trial: optuna.Trial, n_actions: int, n_envs: int, additio
 
 def _suggest_guided(trial: optuna.Trial) -> dict[str, Any]:
     """
+    Suggest what all algorithms that learn from takeovers have in common.
+
     :return: what all algorithms that learn from takeovers have in common, before the conversion
     """
     params: dict[str, Any] = {
@@ -126,6 +134,8 @@ def _suggest_multiplier(trial: optuna.Trial) -> dict[str, Any]:
 
 def sample_bc_params(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> dict[str, Any]:
     """
+    Sample hyperparameters of BC.
+
     :return: keyword arguments of BC. For the parameters see ``sample_dsac_params``
     """
     params: dict[str, Any] = {
@@ -141,6 +151,8 @@ def sample_bc_params(trial: optuna.Trial, n_actions: int, n_envs: int, additiona
 
 def convert_bc_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
     """
+    Convert sampled values to keyword arguments.
+
     :param sampled_params: as Optuna stores them
     :return: keyword arguments of BC, HGDagger or IWR, which have no discount factor
     """
@@ -151,6 +163,8 @@ def convert_bc_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
 
 def sample_cql_params(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> dict[str, Any]:
     """
+    Sample hyperparameters of CQL.
+
     :return: keyword arguments of CQL. For the parameters see ``sample_dsac_params``
     """
     params: dict[str, Any] = {
@@ -169,6 +183,8 @@ def sample_cql_params(trial: optuna.Trial, n_actions: int, n_envs: int, addition
 
 def sample_gail_params(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> dict[str, Any]:
     """
+    Sample hyperparameters of GAIL.
+
     :return: keyword arguments of GAIL. For the parameters see ``sample_dsac_params``
     """
     return sample_ppo_params(trial, n_actions, n_envs, additional_args) | {

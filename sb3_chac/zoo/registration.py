@@ -26,6 +26,8 @@ def register() -> None:
 
 def add_environments(envs: ModuleType) -> None:
     """
+    Register our environments.
+
     :param envs: ``gymnasium.envs``, whose registry our package fills when it is imported
     """
     importlib.import_module("sb3_chac.envs")
@@ -33,6 +35,8 @@ def add_environments(envs: ModuleType) -> None:
 
 def add_algorithms(utils: ModuleType) -> None:
     """
+    Register our algorithms with RL-Zoo3.
+
     :param utils: ``rl_zoo3.utils``, whose ``ALGOS`` the rest of RL-Zoo3 shares by reference
     """
     from sb3_chac.zoo.errors import store_dict
@@ -44,6 +48,8 @@ def add_algorithms(utils: ModuleType) -> None:
 
 def add_experiments(exp_manager: ModuleType) -> None:
     """
+    Extend RL-Zoo3's experiments.
+
     :param exp_manager: ``rl_zoo3.exp_manager``
     """
     from sb3_chac.zoo.experiments import extend
@@ -56,6 +62,8 @@ def add_experiments(exp_manager: ModuleType) -> None:
 
 def add_training(train: ModuleType) -> None:
     """
+    Extend RL-Zoo3's training command.
+
     :param train: ``rl_zoo3.train``, whose command ends in one line for what is wrong with its arguments, and with one sentence
         when it is stopped before our algorithms, or others in our environments, learn
     """

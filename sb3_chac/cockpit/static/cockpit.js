@@ -1,11 +1,17 @@
 "use strict";
 
 const HEARTBEAT = 50; // [ms] between two messages of the driver
+const SOONEST = 20; // [ms] between two messages while a thumb moves
+const DEAD_ZONE = 0.08; // of a pad's way, and of the tilt's
+const WAY = 80; // [px] that a thumb moves for the whole steering
+const TILT = Math.PI / 6; // [rad] for the whole steering
+const SURE = 3000; // [ms] in which a second press quits
+const FLASH = 800; // [ms] that a collision is seen
 const KEYS = {
   ArrowLeft: "left", KeyA: "left", ArrowRight: "right", KeyD: "right",
   ArrowUp: "up", KeyW: "up", ArrowDown: "down", KeyS: "down",
 };
-const WISHES = { Space: "takeover", KeyP: "pause", KeyN: "skip", KeyQ: "quit", KeyH: "help" };
+const WISHES = { Space: "takeover", KeyP: "pause", KeyN: "skip", KeyQ: "quit" };
 const BUTTONS = { 0: "takeover", 9: "pause", 8: "skip" }; // of a gamepad with the standard mapping
 const ROLES = {
   driver: "You are at the wheel",
@@ -13,15 +19,84 @@ const ROLES = {
   free: "Nobody is at the wheel",
   spectator: "You watch",
 };
+const DRIVERS = { person: "A person drives", brake: "Nobody is at the wheel: the car brakes", novice: "The novice drives" };
 
 const byId = (id) => document.getElementById(id);
 const held = new Map(); // code of the key -> what it does
 const pressed = new Set(); // buttons of the gamepad
 const sentAt = new Map(); // number of a ping -> time
+const touched = { steering: null, pedals: null }; // value of each pad, null while nobody touches it
+let tilt = null; // steering, null if the phone does not tell
 let role = "";
 let pings = 0;
+let toldAt = 0;
+let collisions = null;
+let asks = false; // whether the novice asks for help
 const socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/ws${location.search}`);
 socket.binaryType = "blob";
+
+// Options, kept by the browser
+
+const options = { pads: matchMedia("(any-pointer: coarse)").matches, tilt: false, vibration: true, sound: false };
+let audio = null;
+
+function keepOptions() {
+  try {
+    localStorage.setItem("cockpit", JSON.stringify(options));
+  } catch { /* a browser that keeps nothing */ }
+}
+
+function readOptions() {
+  try {
+    const kept = JSON.parse(localStorage.getItem("cockpit"));
+    for (const name in options) if (typeof kept?.[name] === "boolean") options[name] = kept[name];
+  } catch { /* nothing was kept */ }
+}
+
+async function setOption(name, isOn) {
+  options[name] = isOn;
+  if (name === "tilt" && isOn && typeof DeviceOrientationEvent?.requestPermission === "function") {
+    options.tilt = await DeviceOrientationEvent.requestPermission().catch(() => "denied") === "granted";
+    byId("option-tilt").checked = options.tilt;
+  }
+  if (name === "sound" && isOn) beep();
+  keepOptions();
+  layout();
+}
+
+function beep(frequency = 220) {
+  audio ??= new AudioContext();
+  audio.resume();
+  const [tone, volume] = [audio.createOscillator(), audio.createGain()];
+  tone.frequency.value = frequency;
+  volume.gain.setValueAtTime(0.3, audio.currentTime);
+  volume.gain.exponentialRampToValueAtTime(0.001, audio.currentTime + 0.4);
+  tone.connect(volume).connect(audio.destination);
+  tone.start();
+  tone.stop(audio.currentTime + 0.4);
+}
+
+readOptions();
+for (const name in options) {
+  const box = byId(`option-${name}`);
+  box.checked = options[name];
+  box.addEventListener("change", () => setOption(name, box.checked));
+}
+
+// The arrangement
+
+function layout() {
+  const [width, height] = [innerWidth, innerHeight];
+  let name = "wide";
+  if (width < height) name = "tall";
+  else if (options.pads || height < 480 || width < 700 || (height < 620 && width >= 1.5 * height)) name = "low";
+  else if (width < 1.5 * height) name = "square";
+  document.body.dataset.layout = name;
+  document.body.classList.toggle("pads", options.pads);
+}
+
+addEventListener("resize", layout);
+layout();
 
 // What the driver does
 
@@ -31,6 +106,10 @@ function send(message) {
 
 function clamp(value) {
   return Math.min(Math.max(value, -1), 1);
+}
+
+function beyondDeadZone(value) {
+  return clamp(Math.sign(value) * Math.max(Math.abs(value) - DEAD_ZONE, 0) / (1 - DEAD_ZONE));
 }
 
 function gamepad() {
@@ -44,30 +123,55 @@ function gamepad() {
   return [clamp(pad.axes[0]), clamp(pad.buttons[7].value), clamp(pad.buttons[6].value)];
 }
 
+function touch() {
+  if (touched.steering === null && touched.pedals === null) return null;
+  return [touched.steering ?? (options.tilt && tilt !== null ? tilt : 0), touched.pedals ?? 0];
+}
+
 function tellHeld() {
   if (role === "driver" && document.hasFocus() && !document.hidden) {
-    send({ keys: [...new Set(held.values())], gamepad: gamepad() });
+    toldAt = performance.now();
+    send({ keys: [...new Set(held.values())], gamepad: gamepad(), touch: touch() });
   }
 }
 
+function tellSoon() {
+  if (performance.now() - toldAt >= SOONEST) tellHeld();
+}
+
 function ask(wish) {
-  if (wish === "help") byId("help").hidden = !byId("help").hidden;
-  else if (role === "driver") send({ wish });
-  if (wish === "pause") byId("help").hidden = true;
+  if (role === "driver") send({ wish });
+}
+
+function open(id) {
+  const dialog = byId(id);
+  if (dialog.open) dialog.close(); else dialog.showModal();
 }
 
 function leave() {
   held.clear();
+  for (const name in touched) {
+    touched[name] = null;
+    byId(name).classList.remove("held");
+  }
   if (role === "driver") send({ wish: "away" });
 }
 
+/** Whether the key belongs to the button that has the keyboard, as for those who use no mouse. */
+function isForButton(event) {
+  const focused = document.activeElement;
+  return event.code === "Space" && focused?.matches("button:focus-visible, input:focus-visible");
+}
+
 addEventListener("keydown", (event) => {
-  if (event.ctrlKey || event.altKey || event.metaKey) return;
+  if (event.ctrlKey || event.altKey || event.metaKey || isForButton(event)) return;
   if (event.code in KEYS) {
     held.set(event.code, KEYS[event.code]);
     if (!event.repeat) tellHeld();
   } else if (event.code in WISHES) {
     if (!event.repeat) ask(WISHES[event.code]);
+  } else if (event.code === "KeyH") {
+    if (!event.repeat) open("help");
   } else return;
   event.preventDefault();
 });
@@ -76,75 +180,198 @@ addEventListener("keyup", (event) => {
 });
 addEventListener("blur", leave);
 document.addEventListener("visibilitychange", () => { if (document.hidden) leave(); });
-for (const button of document.querySelectorAll("[data-wish]")) {
-  button.addEventListener("click", () => {
-    button.blur(); // Space is for takeovers
-    ask(button.dataset.wish);
+
+/** After a click Space is for takeovers again; who came by the keyboard stays where they are. */
+function onClick(button, act) {
+  button.addEventListener("click", (event) => {
+    if (event.detail > 0) button.blur();
+    act();
   });
 }
-byId("wheel").addEventListener("click", () => {
-  byId("wheel").blur();
-  send({ wish: "wheel" });
-});
+
+let sureUntil = 0;
+
+function quitTwice() {
+  const quit = document.querySelector("[data-wish=quit]");
+  if (performance.now() < sureUntil) {
+    ask("quit");
+    return;
+  }
+  sureUntil = performance.now() + SURE;
+  quit.textContent = "Sure?";
+  setTimeout(() => { quit.textContent = "Quit"; }, SURE);
+}
+
+for (const button of document.querySelectorAll("[data-wish]")) {
+  const wish = button.dataset.wish;
+  onClick(button, wish === "quit" ? quitTwice : () => ask(wish));
+}
+for (const button of document.querySelectorAll("[data-opens]")) onClick(button, () => open(button.dataset.opens));
+onClick(byId("wheel"), () => send({ wish: "wheel" }));
 setInterval(tellHeld, HEARTBEAT);
 setInterval(() => {
   sentAt.set(++pings, performance.now());
   send({ ping: pings });
 }, 1000);
 
+// Pads: one thumb each
+
+function makePad(name, value) {
+  const pad = byId(name);
+  const knob = pad.querySelector(".knob");
+  let pointer = null;
+  let start = null;
+  const move = (event) => {
+    const box = pad.getBoundingClientRect();
+    const place = { x: event.clientX - box.left, y: event.clientY - box.top };
+    start ??= place;
+    touched[name] = beyondDeadZone(value(place, start, box));
+    knob.style.left = `${place.x}px`;
+    knob.style.top = `${place.y}px`;
+  };
+  const end = (event) => {
+    if (event.pointerId !== pointer) return;
+    pointer = start = touched[name] = null;
+    pad.classList.remove("held");
+    tellHeld();
+  };
+  pad.addEventListener("pointerdown", (event) => {
+    event.preventDefault();
+    if (pointer !== null || role !== "driver") return;
+    pointer = event.pointerId;
+    pad.setPointerCapture(pointer);
+    pad.classList.add("held");
+    move(event);
+    tellHeld();
+  });
+  pad.addEventListener("pointermove", (event) => {
+    if (event.pointerId !== pointer || touched[name] === null) return;
+    move(event);
+    tellSoon();
+  });
+  for (const kind of ["pointerup", "pointercancel", "lostpointercapture"]) pad.addEventListener(kind, end);
+  pad.addEventListener("contextmenu", (event) => event.preventDefault());
+}
+
+// Steering from where the thumb came down, so that one need not look; pedals by their place
+makePad("steering", (place, start, box) => (place.x - start.x) / Math.min(WAY, box.width / 2.5));
+makePad("pedals", (place, start, box) => 1 - (2 * place.y) / box.height);
+
+// How far the right side of the screen is lower than the left one
+addEventListener("deviceorientation", ({ beta, gamma }) => {
+  if (beta === null || gamma === null) return;
+  const radians = Math.PI / 180;
+  const [x, y] = [-Math.cos(beta * radians) * Math.sin(gamma * radians), Math.sin(beta * radians)]; // of the upward direction
+  const right = { 0: x, 90: -y, 180: -x, 270: y }[screen.orientation?.angle ?? 0];
+  tilt = beyondDeadZone(-Math.asin(clamp(right)) / TILT);
+  if (options.tilt && touch() !== null) tellSoon();
+});
+
+// A phone that nobody touches goes dark, and the drive would pause
+async function stayAwake() {
+  try {
+    if (!document.hidden) await navigator.wakeLock?.request("screen");
+  } catch { /* not allowed: it goes dark */ }
+}
+document.addEventListener("visibilitychange", stayAwake);
+stayAwake();
+
 // What is shown
 
-function bar(row, low, high) {
-  const end = (text, name) => {
-    const label = document.createElement("span");
-    label.className = `end ${name}`;
-    label.textContent = text;
-    row.append(label);
-  };
-  end(low, "low");
+function bar(row, name) {
   const outer = document.createElement("div");
   outer.className = "bar";
+  outer.setAttribute("role", "meter");
+  outer.setAttribute("aria-label", `${row.firstElementChild.textContent}, ${name}`);
+  outer.setAttribute("aria-valuemin", -1);
+  outer.setAttribute("aria-valuemax", 1);
+  outer.setAttribute("aria-valuenow", 0);
   const inner = document.createElement("div");
   outer.append(inner);
   row.append(outer);
-  end(high, "high");
   return (value) => {
     const share = 50 * clamp(value);
     inner.style.left = `${50 + Math.min(share, 0)}%`;
     inner.style.width = `${Math.abs(share)}%`;
+    outer.setAttribute("aria-valuenow", value.toFixed(2));
   };
 }
 
 const bars = {};
 for (const name of ["proposed", "applied", "input"]) {
-  bars[name] = [bar(byId(name), "left", "right"), bar(byId(name), "brake", "throttle")];
+  bars[name] = [bar(byId(name), "steering, left to right"), bar(byId(name), "pedals, brake to throttle")];
+}
+
+function makeCell(name) {
+  const cell = document.createElement("div");
+  cell.className = "cell";
+  const term = document.createElement("dt");
+  term.textContent = name;
+  const value = document.createElement("dd");
+  value.id = `${name.replaceAll(" ", "-")}-value`;
+  cell.append(term, value);
+  if (name === "confidence" || name === "risk") {
+    const meter = document.createElement("dd");
+    meter.className = "meter";
+    meter.id = `${name}-bar`;
+    meter.append(document.createElement("div"));
+    cell.append(meter);
+  }
+  return cell;
+}
+
+function setText(element, text) {
+  if (element.textContent !== text) element.textContent = text;
+}
+
+function vibrate(pattern) {
+  // Browsers refuse it until the page was touched
+  if (options.vibration && navigator.userActivation?.hasBeenActive) navigator.vibrate?.(pattern);
+}
+
+function showQuery(isAsking) {
+  if (isAsking && !asks) {
+    vibrate([80, 60, 80]);
+    if (options.sound) beep(660);
+  }
+  asks = isAsking;
+  document.body.classList.toggle("asks", asks);
+}
+
+function showCollisions(number) {
+  if (collisions !== null && number > collisions) {
+    byId("view").classList.add("hit");
+    setTimeout(() => byId("view").classList.remove("hit"), FLASH);
+    vibrate(200);
+    if (options.sound) beep();
+  }
+  collisions = number;
 }
 
 function show(state) {
   role = state.role;
-  document.body.classList.toggle("takeover", state.takeover);
-  byId("role").textContent = ROLES[role];
+  document.body.dataset.driver = state.driver;
+  const told = state.driver === "person" && role === "driver" ? "You drive" : DRIVERS[state.driver];
+  setText(byId("told"), state.asks ? "The novice asks for help" : told);
+  setText(byId("role"), ROLES[role]);
   byId("wheel").hidden = role !== "free";
   byId("notice").hidden = !state.notice;
-  byId("notice").textContent = state.notice;
+  setText(byId("notice"), state.notice);
   byId("notice").classList.toggle("waits", state.waits);
   const list = byId("indicators");
-  if (list.childElementCount !== 2 * state.indicators.length) {
-    list.replaceChildren(...state.indicators.flatMap(([name]) => {
-      const value = document.createElement("dd");
-      value.id = `${name.replaceAll(" ", "-")}-value`;
-      const term = document.createElement("dt");
-      term.textContent = name;
-      return [term, value];
-    }));
+  if (list.childElementCount !== state.indicators.length) list.replaceChildren(...state.indicators.map(([name]) => makeCell(name)));
+  for (const [name, value] of state.indicators) setText(byId(`${name.replaceAll(" ", "-")}-value`), value);
+  for (const name of ["confidence", "risk"]) {
+    byId(`${name}-bar`).hidden = state[name] === null;
+    byId(`${name}-bar`).firstElementChild.style.width = `${100 * (state[name] ?? 0)}%`;
   }
-  for (const [name, value] of state.indicators) byId(`${name.replaceAll(" ", "-")}-value`).textContent = value;
-  byId("confidence").hidden = state.confidence === null;
-  byId("confidence").firstElementChild.style.width = `${100 * (state.confidence ?? 0)}%`;
-  byId("applied").querySelector("span").textContent = state.takeover ? "the driver's" : "the novice's";
+  showQuery(state.asks);
   for (const name of Object.keys(bars)) bars[name].forEach((set, i) => set(state[name][i]));
-  for (const button of document.querySelectorAll("[data-wish]:not([data-wish=help])")) button.disabled = role !== "driver";
-  document.querySelector("[data-wish=takeover]").textContent = state.wants ? "Hand back" : "Take over";
+  for (const button of document.querySelectorAll("[data-wish]")) button.disabled = role !== "driver";
+  for (const name in touched) byId(name).classList.toggle("off", role !== "driver");
+  setText(document.querySelector("[data-wish=takeover]"), state.wants ? "Hand back" : "Take over");
+  setText(document.querySelector("[data-wish=pause]"), state.paused ? "Begin" : "Pause");
+  showCollisions(state.collisions);
 }
 
 async function draw(blob) {
@@ -171,6 +398,7 @@ socket.addEventListener("message", ({ data }) => {
 });
 socket.addEventListener("close", ({ reason }) => {
   role = "";
+  document.body.dataset.driver = "unknown";
   byId("notice").hidden = false;
   byId("notice").textContent = `Not connected${reason ? `: ${reason}` : ""}. Reload the page to connect again`;
   byId("connection").textContent = "";

@@ -28,6 +28,8 @@ class MetaDrivesDriver:
 
     def __call__(self, observation: np.ndarray | None = None) -> np.ndarray:
         """
+        Drive one step.
+
         :return: steering and throttle, shape (2,), in [-1, 1]
         """
         self.watcher(observation)  # it has to see whether the ego dawdles
@@ -35,6 +37,8 @@ class MetaDrivesDriver:
 
     def act(self) -> Any:
         """
+        Ask MetaDrive's policy.
+
         :return: steering and throttle, of any range
         """
         raise NotImplementedError

@@ -1,24 +1,22 @@
 """MetaDriveSafety-v0: the simulator of the paper's experiments behind the interface of SafeDrive."""
 
 import math
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
-import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
 from sb3_chac.common.arguments import checked
 from sb3_chac.common.checks import check_driving_action, check_integer, check_range
-from sb3_chac.common.contract import TakeoverDisplay
-from sb3_chac.envs.display import STEPS_PER_SECOND
 from sb3_chac.envs.driving.corridors import FAR, LATERALS, N_CORRIDORS, N_VIEW, ROUTE_SPACING, CorridorView, route_along
+from sb3_chac.envs.driving.display import Display
+from sb3_chac.envs.driving.env import CONTACT_MEMORY, DrivingEnv
 from sb3_chac.envs.metadrive.drivers import DRIVERS
 from sb3_chac.envs.metadrive.simulator import check_installed, is_headless, make_simulator, prepare, release
 
 N_EGO, N_CHECKPOINT, N_LIDAR = 9, 5, 240  # of the ego, of each of two checkpoints, rays
 N_OBSERVATION = N_EGO + 2 * N_CHECKPOINT + N_LIDAR
 MAX_SCENARIO = 1_000_000
-CONTACT_MEMORY = 10  # steps without contact after which touching the same object is a new collision
 # MetaDrive's, which are lost if any of them is changed
 SPAWN = {
     "use_special_color": True,
@@ -55,7 +53,7 @@ PRESETS = {
 }
 
 
-class MetaDriveSafetyEnv(gym.Env, TakeoverDisplay):
+class MetaDriveSafetyEnv(DrivingEnv):
     """
     MetaDrive's SafeMetaDriveEnv: drive through seeded maps of three blocks among traffic, cones, warning triangles, barriers
     and broken-down vehicles; ten decisions per second. One environment per process (see ``EngineInUse``).
@@ -128,11 +126,8 @@ class MetaDriveSafetyEnv(gym.Env, TakeoverDisplay):
     :raises EngineInUse: for a second environment in this process
     """
 
-    metadata = {"render_modes": ["rgb_array", "human"], "render_fps": STEPS_PER_SECOND}  # noqa: RUF012
-    # What a runtime on a vehicle has to know (sb3_chac.deploy.metadata)
+    metadata: ClassVar[dict[str, Any]] = {**DrivingEnv.metadata, "steers_left": True}  # type: ignore[misc]
     action_names = ("steering", "throttle")
-    brake_action = (None, -1.0)  # keeps the steering
-    coast_action = (None, 0.0)
 
     @checked
     def __init__(
@@ -163,14 +158,10 @@ class MetaDriveSafetyEnv(gym.Env, TakeoverDisplay):
         check_integer("horizon", settings.horizon, low=1)
         if contact_limit is not None:
             check_integer("contact_limit", contact_limit, low=1)
-        if render_mode is not None and render_mode not in self.metadata["render_modes"]:
-            raise ValueError(f"render_mode must be None or one of {self.metadata['render_modes']}, got {render_mode!r}.")
+        self._set_up(start_scenario, settings.num_scenarios, render_mode)
         check_installed()
         prepare(is_headless(headless))
-        self.start_scenario, self.num_scenarios = int(start_scenario), int(settings.num_scenarios)
         self.horizon, self.contact_limit = int(settings.horizon), contact_limit
-        self.render_mode = render_mode
-        self.hud: dict[str, Any] = {}  # what wrappers want to have shown beside the speed
         self.action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
         self.raw_observations = bool(raw_observations)
         self._corridors = CorridorView(N_LIDAR, LIDAR_REACH, STRIPS) if corridors and not raw_observations else None
@@ -180,7 +171,6 @@ class MetaDriveSafetyEnv(gym.Env, TakeoverDisplay):
             low = np.concatenate([low, np.zeros(N_CORRIDORS), -np.ones(N_VIEW - N_CORRIDORS)])
             high = np.concatenate([high, np.ones(N_VIEW)])
         self.observation_space = spaces.Box(low.astype(np.float32), high.astype(np.float32))
-        self._viewer: Any = None
         self.simulator = make_simulator(
             self,
             dict(
@@ -198,19 +188,13 @@ class MetaDriveSafetyEnv(gym.Env, TakeoverDisplay):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
         """
+        Begin an episode.
+
         :param options: {"scenario": k} to drive map k
         :raises ValueError: if k is not an integer from 0 to 999,999
         """
-        super().reset(seed=seed)
-        if options and "scenario" in options:
-            check_integer("options['scenario']", options["scenario"], low=0)
-            check_range("options['scenario']", options["scenario"], high=MAX_SCENARIO - 1)
-            self.scenario = int(options["scenario"])
-        else:
-            self.scenario = self.start_scenario + int(self.np_random.integers(self.num_scenarios))
+        self._begin_episode(seed, options)
         observation, info = self.simulator.reset(seed=self.scenario)
-        self.steps, self.episode_cost, self.collisions = 0, 0, 0
-        self._touched: dict[Any, int] = {}  # object -> step of the last contact
         self._contact_began: int | None = None  # the step, of a contact that lasts
         info = self._info(info)
         if self._corridors is not None:
@@ -218,6 +202,10 @@ class MetaDriveSafetyEnv(gym.Env, TakeoverDisplay):
         if self.render_mode == "human":
             self.render()
         return self._observed(observation), info
+
+    def _check_scenario(self, name: str, value: Any) -> None:
+        check_integer(name, value, low=0)
+        check_range(name, value, high=MAX_SCENARIO - 1)
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         check_driving_action(action)
@@ -234,15 +222,13 @@ class MetaDriveSafetyEnv(gym.Env, TakeoverDisplay):
 
     def _count_collisions(self, info: dict[str, Any]) -> None:
         """
-        Those that begin.
+        Count the collisions that begin in this step.
 
         :param info: MetaDrive's
         """
         self.collisions = 0
         for name in self._touching(bool(info["crash_vehicle"]), bool(info["crash_object"])):
-            self.collisions += self.steps - self._touched.get(name, -CONTACT_MEMORY) >= CONTACT_MEMORY
-            self._touched[name] = self.steps
-        self.episode_cost += self.collisions
+            self._touch(name)
 
     def _contact_lasts_too_long(self) -> bool:
         last = max(self._touched.values(), default=-CONTACT_MEMORY)
@@ -255,6 +241,8 @@ class MetaDriveSafetyEnv(gym.Env, TakeoverDisplay):
 
     def _touching(self, vehicles: bool, objects: bool) -> set[str]:
         """
+        Name the objects that touch the ego.
+
         :param vehicles: whether a vehicle touched the ego in this step
         :param objects: whether an object did
         :return: names of what did: what still does, or else the nearest of its kind within 15 m, or else its kind (MetaDrive
@@ -286,21 +274,17 @@ class MetaDriveSafetyEnv(gym.Env, TakeoverDisplay):
 
     def _info(self, info: dict[str, Any]) -> dict[str, Any]:
         """
+        Build the info.
+
         :param info: MetaDrive's
         """
-        self.last_info = {
-            "cost": float(self.collisions),
-            "collision": self.collisions > 0,
-            "contact": bool(info["crash_vehicle"] or info["crash_object"]),
-            "out_of_road": bool(info["out_of_road"] and not info["arrive_dest"]),
-            "arrive_dest": bool(info["arrive_dest"]),
-            "is_success": bool(info["arrive_dest"]),
-            "route_completion": 1.0 if info["arrive_dest"] else float(np.clip(info["route_completion"], 0.0, 1.0)),
-            "speed": float(self.ego.speed),
-            "episode_cost": float(self.episode_cost),
-            "contact_cost": float(info["cost"]),
-            "scenario": self.scenario,
-        }
+        self.last_info = self._driving_info(
+            contact=bool(info["crash_vehicle"] or info["crash_object"]),
+            out_of_road=bool(info["out_of_road"] and not info["arrive_dest"]),
+            arrived=bool(info["arrive_dest"]),
+            route_completion=1.0 if info["arrive_dest"] else float(np.clip(info["route_completion"], 0.0, 1.0)),
+            speed=float(self.ego.speed),
+        ) | {"contact_cost": float(info["cost"])}
         return dict(self.last_info)
 
     def _observed(self, observation: np.ndarray) -> np.ndarray:
@@ -331,6 +315,8 @@ class MetaDriveSafetyEnv(gym.Env, TakeoverDisplay):
 
     def scripted_driver(self, name: str = "scripted") -> Any:
         """
+        Make a driver by its name.
+
         :param name: "scripted" (with a human's imperfections), "scripted-ideal" (without), "idm" or "ppo" (MetaDrive's own)
         :return: a driver for this environment
         :raises ValueError: for another name
@@ -341,38 +327,24 @@ class MetaDriveSafetyEnv(gym.Env, TakeoverDisplay):
 
     # Pictures
 
-    def render(self) -> np.ndarray | None:
-        """
-        :return: the picture, shape (600, 800, 3), uint8, with render_mode "rgb_array", else None
-        :raises ResetNeeded: before the first reset
-        :raises RuntimeError: if render_mode is "human" and there is no display
-        """
-        if self.render_mode is None:
-            gym.logger.warn("render() does nothing without a render_mode, for example render_mode='rgb_array'.")
-            return None
-        if not hasattr(self, "steps"):
-            raise gym.error.ResetNeeded("Call reset() before render().")
-        if self._viewer is None:
-            from sb3_chac.envs.metadrive.render import Viewer
+    def _make_viewer(self) -> Display:
+        from sb3_chac.envs.metadrive.render import Viewer
 
-            self._viewer = Viewer(self)
-        if self.render_mode == "rgb_array":
-            return self._viewer.frame()
-        self._viewer.show()
-        return None
+        return Viewer(self)
 
     def plot_map(self, axes: Any) -> None:
         """
+        Draw the map of the current scenario.
+
         :param axes: of matplotlib, where the map of the current scenario is drawn, in metres
         """
-        from sb3_chac.envs.metadrive.map import plot_map
+        from sb3_chac.envs.metadrive.roads import plot_map
 
         plot_map(self, axes)
 
     def close(self) -> None:
-        if self._viewer is not None:
-            self._viewer.close()
-            self._viewer = None
+        """Close the viewer and MetaDrive's engine."""
+        super().close()
         release(self)
 
 
@@ -417,6 +389,8 @@ def route_ahead(observation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _road(values: list[float], width: float) -> tuple[tuple[float, float], float, float]:
     """
+    Rebuild a road from the observation of its end.
+
     :param values: of a checkpoint, as MetaDrive gives them, each in [0, 1]
     :param width: [m] of the road
     :return: position [m] of the checkpoint, curvature [1/m] of the middle of the road that ends there, positive to the left,

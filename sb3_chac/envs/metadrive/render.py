@@ -5,8 +5,21 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sb3_chac.envs.display import ASPHALT, FINE, FLASH_STEPS, LINE, PARKED, RED, ROUTE, TRAFFIC, WHITE, Area, Display, turned
-from sb3_chac.envs.metadrive.map import destination, patches, things
+from sb3_chac.envs.driving.display import (
+    ASPHALT,
+    FINE,
+    FLASH_STEPS,
+    LINE,
+    PARKED,
+    RED,
+    ROUTE,
+    TRAFFIC,
+    WHITE,
+    Area,
+    Display,
+    turned,
+)
+from sb3_chac.envs.metadrive.roads import destination, patches, things
 
 if TYPE_CHECKING:
     from sb3_chac.envs.metadrive.env import MetaDriveSafetyEnv
@@ -18,6 +31,8 @@ DOWNWARDS = np.array([1.0, -1.0])  # MetaDrive's y axis points upwards
 
 class Viewer(Display):
     """
+    View of MetaDrive from above.
+
     :param env: the environment to show
     """
 

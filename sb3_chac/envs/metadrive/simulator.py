@@ -28,6 +28,8 @@ class EngineInUse(gym.error.Error):
 
 def check_installed() -> None:
     """
+    Check that MetaDrive is installed.
+
     :raises DependencyNotInstalled: unless MetaDrive and the pygame that it imports are there
     """
     if importlib.util.find_spec("metadrive") is None:
@@ -45,6 +47,8 @@ def check_installed() -> None:
 
 def is_headless(headless: bool | None) -> bool:
     """
+    Decide whether to go without MetaDrive's assets.
+
     :param headless: what the user said, None to let the environment variable decide
     """
     return os.environ.get(HEADLESS_VARIABLE, "0") not in ("", "0") if headless is None else headless
@@ -72,6 +76,8 @@ def prepare(headless: bool) -> None:
 
 def make_simulator(owner: Any, config: dict[str, Any]) -> "SafeMetaDriveEnv":
     """
+    Make MetaDrive's environment.
+
     :param owner: the environment that the engine is for, until it calls ``release`` or is garbage
     :param config: what differs from SafeMetaDriveEnv's defaults
     :raises EngineInUse: if another environment of this process has the engine

@@ -4,19 +4,19 @@ import math
 from collections import OrderedDict
 from typing import Any, NamedTuple
 
-import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from highway_env.road.road import Road
 
 from sb3_chac.common.arguments import checked
 from sb3_chac.common.checks import check_driving_action, check_integer, check_range
-from sb3_chac.common.contract import TakeoverDisplay
-from sb3_chac.envs.display import STEPS_PER_SECOND
 from sb3_chac.envs.driving.compiled import compiled
 from sb3_chac.envs.driving.corridors import N_VIEW, CorridorView
+from sb3_chac.envs.driving.display import STEPS_PER_SECOND, Display
+from sb3_chac.envs.driving.env import DrivingEnv
+from sb3_chac.envs.driving.geometry import boxes_overlap
 from sb3_chac.envs.safedrive.driver import IMPERFECTIONS, ScriptedDriver
-from sb3_chac.envs.safedrive.geometry import Pose, boxes_overlap
+from sb3_chac.envs.safedrive.geometry import Pose
 from sb3_chac.envs.safedrive.lidar import Lidar
 from sb3_chac.envs.safedrive.map import BLOCKS, HALF_WIDTH, LANES, OBSTACLE_SIZES, Map
 from sb3_chac.envs.safedrive.navigation import N_EGO, N_STATE, locate, navigation, route_ahead
@@ -24,8 +24,6 @@ from sb3_chac.envs.safedrive.traffic import CAR_LENGTH, CAR_WIDTH, Traffic
 from sb3_chac.envs.safedrive.vehicle import MAX_SPEED, Ego
 
 SUBSTEPS = 2
-ARRIVES_BEFORE_END = 5.0  # [m]
-CONTACT_MEMORY = 10  # steps without contact after which touching the same object is a new collision
 PARKED_TOWED_AFTER = 50  # steps after a collision with a parked vehicle
 SCENES_KEPT = 64
 
@@ -41,7 +39,7 @@ class Scene(NamedTuple):
     obstacle_sizes: np.ndarray  # length and width
 
 
-class SafeDriveEnv(gym.Env, TakeoverDisplay):
+class SafeDriveEnv(DrivingEnv):
     """
     Drive a route through seeded maps of straights, curves, ramps, roundabouts, T-intersections and intersections, among
     traffic, cones, warning triangles and parked vehicles; ten decisions per second.
@@ -111,11 +109,7 @@ class SafeDriveEnv(gym.Env, TakeoverDisplay):
     :raises ValueError: for an argument out of its range
     """
 
-    metadata = {"render_modes": ["rgb_array", "human"], "render_fps": STEPS_PER_SECOND}  # noqa: RUF012
-    # What a runtime on a vehicle has to know (sb3_chac.deploy.metadata)
     action_names = ("steering", "acceleration")
-    brake_action = (None, -1.0)  # keeps the steering
-    coast_action = (None, 0.0)
 
     @checked
     def __init__(
@@ -152,9 +146,7 @@ class SafeDriveEnv(gym.Env, TakeoverDisplay):
         )  # fmt: skip
         for name, value in coefficients.items():
             check_range(name, value, low=0.0)
-        if render_mode is not None and render_mode not in self.metadata["render_modes"]:
-            raise ValueError(f"render_mode must be None or one of {self.metadata['render_modes']}, got {render_mode!r}.")
-        self.start_scenario, self.num_scenarios = int(start_scenario), int(num_scenarios)
+        self._set_up(start_scenario, num_scenarios, render_mode)
         self.traffic_density, self.obstacle_density = traffic_density, obstacle_density
         self.blocks = blocks if isinstance(blocks, str) else int(blocks)
         self.horizon = int(horizon)
@@ -164,8 +156,7 @@ class SafeDriveEnv(gym.Env, TakeoverDisplay):
             collision_penalty,
         )
         self.arrival_reward, self.out_of_road_penalty = arrival_reward, out_of_road_penalty
-        self.render_mode, self.show_lidar = render_mode, show_lidar
-        self.hud: dict[str, Any] = {}  # what wrappers want to have shown beside the speed
+        self.show_lidar = show_lidar
 
         self.action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
         self.lidar = Lidar()
@@ -173,7 +164,6 @@ class SafeDriveEnv(gym.Env, TakeoverDisplay):
         self._n_observation = N_STATE + self.lidar.rays + N_VIEW * corridors
         self.observation_space = spaces.Box(-1.0, 1.0, (self._n_observation,), np.float32)
         self._scenes: OrderedDict[int, Scene] = OrderedDict()
-        self._viewer: Any = None
 
     # Scenes
 
@@ -197,15 +187,12 @@ class SafeDriveEnv(gym.Env, TakeoverDisplay):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
         """
+        Begin an episode.
+
         :param options: {"scenario": k} to drive map k
         :raises ValueError: if k is not an integer
         """
-        super().reset(seed=seed)
-        if options and "scenario" in options:
-            check_integer("options['scenario']", options["scenario"], low=-(2**62))
-            self.scenario = int(options["scenario"])
-        else:
-            self.scenario = self.start_scenario + int(self.np_random.integers(self.num_scenarios))
+        self._begin_episode(seed, options)
         self.scene = self._scene(self.scenario)
         self.map, self.traffic = self.scene.map, self.scene.traffic
         self.traffic.reset()
@@ -213,9 +200,7 @@ class SafeDriveEnv(gym.Env, TakeoverDisplay):
         self.ego = Ego(self.map.start.shifted(self.s, self.lateral))
         self.heading_error = 0.0
         self.last_action = np.zeros(2)
-        self.steps, self.episode_cost = 0, 0
-        self.collisions, self.contact, self.arrived, self.out_of_road = 0, False, False, False
-        self._touched: dict[tuple[str, int], int] = {}  # object -> step of the last contact
+        self.contact, self.arrived, self.out_of_road = False, False, False
         self._tow: dict[int, int] = {}  # parked vehicle that was hit -> step at which it is gone
         self._find_boxes()
         if self._corridors is not None:
@@ -236,9 +221,7 @@ class SafeDriveEnv(gym.Env, TakeoverDisplay):
         check_driving_action(action)
         action = np.minimum(np.maximum(np.asarray(action, dtype=float), -1.0), 1.0)
         before = Pose(ego.position[0], ego.position[1], ego.heading)
-        ego.control(action[0], action[1])
-        for _ in range(SUBSTEPS):
-            ego.step(1 / (STEPS_PER_SECOND * SUBSTEPS))
+        action = self._move(action)
         previous_s = self.s
         self._locate()
         self.traffic.step(1 / STEPS_PER_SECOND, self.s, self.lateral, ego.speed, ego.position, ego.heading)
@@ -250,7 +233,7 @@ class SafeDriveEnv(gym.Env, TakeoverDisplay):
         self._find_boxes()
         self._collide(before)
 
-        self.arrived = self.s >= self.map.length - ARRIVES_BEFORE_END
+        self.arrived = self.s >= self.map.finish
         self.out_of_road = abs(self.lateral) > HALF_WIDTH and not self.arrived
         reward = self.displacement_reward * (self.s - previous_s) + self.speed_reward * ego.speed / MAX_SPEED
         reward += self.arrival_reward * self.arrived - self.out_of_road_penalty * self.out_of_road
@@ -259,6 +242,17 @@ class SafeDriveEnv(gym.Env, TakeoverDisplay):
             self.render()
         terminated = self.arrived or self.out_of_road
         return self._observe(), float(reward), terminated, self.steps >= self.horizon, self._info()
+
+    def _move(self, action: np.ndarray) -> np.ndarray:
+        """
+        Move the ego for one step.
+
+        :return: the action that was executed
+        """
+        self.ego.control(action[0], action[1])
+        for _ in range(SUBSTEPS):
+            self.ego.step(1 / (STEPS_PER_SECOND * SUBSTEPS))
+        return action
 
     def _locate(self) -> None:
         """Where the ego is on the route, looked for close to where it was (the route may pass near itself)."""
@@ -296,9 +290,7 @@ class SafeDriveEnv(gym.Env, TakeoverDisplay):
         box_ids = self.box_ids if len(hits) else []
         for i in hits:
             kind, index = box_ids[i]
-            if self.steps - self._touched.get((kind, index), -CONTACT_MEMORY) >= CONTACT_MEMORY:
-                self.collisions += 1
-            self._touched[kind, index] = self.steps
+            self._touch((kind, index))
             self.contact = True
             if kind == "obstacle" and self.map.obstacles[index].kind != "parked":
                 self.traffic.remove_obstacle(index)
@@ -309,7 +301,6 @@ class SafeDriveEnv(gym.Env, TakeoverDisplay):
                 self._tow.setdefault(index, self.steps + PARKED_TOWED_AFTER)
             if d[i] @ ego.direction > 0:  # the ego ran into it
                 ego.position, ego.heading, ego.speed = np.array(before[:2]), before.heading, 0.0
-        self.episode_cost += self.collisions
         if len(hits):
             self._locate()
             self._find_boxes()
@@ -336,6 +327,8 @@ class SafeDriveEnv(gym.Env, TakeoverDisplay):
 
     def scan(self) -> tuple[np.ndarray, np.ndarray]:
         """
+        Cast the lidar's rays.
+
         :return: [m] distances along the lidar's rays, shape (240,), and indices of the boxes that can be seen
         """
         return self.lidar.scan(
@@ -343,22 +336,20 @@ class SafeDriveEnv(gym.Env, TakeoverDisplay):
         )
 
     def _info(self) -> dict[str, Any]:
-        return {
-            "cost": float(self.collisions),
-            "collision": self.collisions > 0,
-            "contact": self.contact,
-            "out_of_road": self.out_of_road,
-            "arrive_dest": self.arrived,
-            "is_success": self.arrived,
-            "route_completion": float(min(max(self.s / (self.map.length - ARRIVES_BEFORE_END), 0.0), 1.0)),
-            "speed": self.ego.speed,
-            "episode_cost": float(self.episode_cost),
-            "scenario": self.scenario,
-        }
+        return self._driving_info(
+            contact=self.contact,
+            out_of_road=self.out_of_road,
+            arrived=self.arrived,
+            route_completion=float(min(max(self.s / self.map.finish, 0.0), 1.0)),
+            speed=self.ego.speed,
+        )
 
     def scripted_driver(self, name: str = "scripted") -> ScriptedDriver:
         """
-        :param name: "scripted" (with a human's imperfections) or "scripted-ideal" (without)
+        Make a driver by its name.
+
+        :param name: "scripted" (with a human's imperfections), "scripted-careful" (the same at 8 instead of 10 m/s) or
+            "scripted-ideal" (without imperfections)
         :return: a driver for this environment
         :raises ValueError: for another name
         """
@@ -373,33 +364,15 @@ class SafeDriveEnv(gym.Env, TakeoverDisplay):
 
     # Pictures
 
-    def render(self) -> np.ndarray | None:
-        """
-        :return: the picture, shape (600, 800, 3), uint8, with render_mode "rgb_array", else None
-        :raises ResetNeeded: before the first reset
-        :raises RuntimeError: if render_mode is "human" and there is no display
-        """
-        if self.render_mode is None:
-            gym.logger.warn("render() does nothing without a render_mode, for example render_mode='rgb_array'.")
-            return None
-        if not hasattr(self, "ego"):
-            raise gym.error.ResetNeeded("Call reset() before render().")
-        if self._viewer is None:
-            from sb3_chac.envs.safedrive.render import Viewer
+    def _make_viewer(self) -> Display:
+        from sb3_chac.envs.safedrive.render import Viewer
 
-            self._viewer = Viewer(self)
-        if self.render_mode == "rgb_array":
-            return self._viewer.frame()
-        self._viewer.show()
-        return None
-
-    def close(self) -> None:
-        if self._viewer is not None:
-            self._viewer.close()
-            self._viewer = None
+        return Viewer(self)
 
     def plot_map(self, axes: Any) -> None:
         """
+        Draw the map of the current scenario.
+
         :param axes: of matplotlib, where the map of the current scenario is drawn, in metres, y downwards
         """
         from sb3_chac.envs.safedrive.plot import plot_map
@@ -420,6 +393,8 @@ class SafeDriveEnv(gym.Env, TakeoverDisplay):
 
 def layout(rays: int, corridors: bool) -> list[dict[str, Any]]:
     """
+    Describe the numbers of an observation.
+
     :param rays: of the lidar
     :param corridors: whether they follow
     :return: of an observation, see ``SafeDriveEnv.observation_layout``; t is tanh
@@ -451,6 +426,8 @@ def layout(rays: int, corridors: bool) -> list[dict[str, Any]]:
 @compiled
 def _boxes(car_positions, car_headings, positions, headings, sizes, there):
     """
+    Collect everything that can be hit or seen.
+
     :param positions: of the obstacles, shape (n, 2), with their headings, sizes (length, width) and whether they are there
     :return: positions, headings, lengths and widths of the cars, then of the obstacles that are there
     """

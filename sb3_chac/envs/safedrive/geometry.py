@@ -4,16 +4,20 @@ from typing import NamedTuple
 
 import numpy as np
 
-SPACING = 0.5  # [m] between the points of a sampled path
+from sb3_chac.envs.driving.geometry import SPACING
 
 
 class Pose(NamedTuple):
+    """Position [m] and heading [rad] in the plane."""
+
     x: float
     y: float
     heading: float
 
     def shifted(self, ahead: float, right: float = 0.0, turn: float = 0.0) -> "Pose":
         """
+        Move and turn the pose.
+
         :param ahead: [m] along the heading
         :param right: [m] to the right of it
         :param turn: [rad] added to the heading
@@ -36,6 +40,8 @@ class Segment(NamedTuple):
 
     def offset(self, right: float) -> "Segment":
         """
+        Return the parallel segment.
+
         :param right: [m]
         :return: the parallel segment at that distance to the right
         """
@@ -48,6 +54,8 @@ class Segment(NamedTuple):
 
 def turn(radius: float, angle: float) -> Segment:
     """
+    Make the segment of a turn.
+
     :param radius: [m]
     :param angle: [rad], positive to the right
     """
@@ -56,6 +64,8 @@ def turn(radius: float, angle: float) -> Segment:
 
 def chain(start: Pose, segments: list[Segment]) -> list[Pose]:
     """
+    Compute the poses between segments.
+
     :return: the pose at the start of every segment, and at the end of the last
     """
     poses = [start]
@@ -66,6 +76,8 @@ def chain(start: Pose, segments: list[Segment]) -> list[Pose]:
 
 def sample(start: Pose, segments: list[Segment]) -> np.ndarray:
     """
+    Sample points along segments.
+
     :return: points every ``SPACING`` along the segments, shape (n, 4): x, y, heading, curvature
     """
     starts = np.cumsum([0.0, *(segment.length for segment in segments)])
@@ -81,45 +93,3 @@ def sample(start: Pose, segments: list[Segment]) -> np.ndarray:
     cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     x, y = poses[:, 0] + ahead * cos - right * sin, poses[:, 1] + ahead * sin + right * cos
     return np.stack([x, y, poses[:, 2] + angle, curvature], axis=1)
-
-
-def wrap_angle(angle):
-    """
-    :param angle: [rad], a float or an array
-    :return: the same angle within [-pi, pi)
-    """
-    return (angle + np.pi) % (2 * np.pi) - np.pi
-
-
-def half_extents(length, width, angle):
-    """
-    :return: half of what a box of ``length`` x ``width``, rotated by ``angle``, extends along and across the axes
-    """
-    cos, sin = np.abs(np.cos(angle)), np.abs(np.sin(angle))
-    return (length * cos + width * sin) / 2, (length * sin + width * cos) / 2
-
-
-def boxes_overlap(
-    position: np.ndarray,
-    heading: np.ndarray | float,
-    length: float,
-    width: float,
-    positions: np.ndarray,
-    headings: np.ndarray,
-    lengths: np.ndarray | float,
-    widths: np.ndarray | float,
-) -> np.ndarray:
-    """
-    Rectangles overlap unless one of their four axes separates them (separating axis theorem).
-
-    :param position: centres, shape (..., 2)
-    :return: whether the boxes overlap, shape (...)
-    """
-    dx, dy = positions[..., 0] - position[..., 0], positions[..., 1] - position[..., 1]
-    cos, sin = np.cos(heading), np.sin(heading)
-    along, across = half_extents(lengths, widths, headings - heading)
-    apart = (np.abs(dx * cos + dy * sin) > length / 2 + along) | (np.abs(dy * cos - dx * sin) > width / 2 + across)
-    cos, sin = np.cos(headings), np.sin(headings)
-    along, across = half_extents(length, width, headings - heading)
-    apart |= (np.abs(dx * cos + dy * sin) > lengths / 2 + along) | (np.abs(dy * cos - dx * sin) > widths / 2 + across)
-    return ~apart

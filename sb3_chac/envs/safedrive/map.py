@@ -6,7 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_chac.envs.safedrive.geometry import Pose, Segment, chain, sample, turn, wrap_angle
+from sb3_chac.envs.driving.geometry import wrap_angle
+from sb3_chac.envs.safedrive.geometry import Pose, Segment, chain, sample, turn
 
 LANE_WIDTH = 4.0  # [m]
 LANES = (-LANE_WIDTH / 2, LANE_WIDTH / 2)  # [m] offsets of the left and the right lane from the middle of a carriageway
@@ -17,6 +18,7 @@ BLOCKS = "SCROTX"  # straight, curve, ramp, roundabout, T-intersection, intersec
 START_STRAIGHT = 25.0  # [m] before the first block
 CONNECTION = 28.0  # [m] of straight road between two blocks
 RUN_OUT = 30.0  # [m] of road beyond the destination
+ARRIVES_BEFORE_END = 5.0  # [m]
 ARM = 60.0  # [m] length of the side roads
 CLEARANCE = 28.0  # [m] between the axes of roads that do not belong together
 
@@ -49,6 +51,8 @@ class Path(NamedTuple):
 
 
 class Obstacle(NamedTuple):
+    """Obstacle on the carriageway of the route."""
+
     kind: str  # of OBSTACLE_SIZES
     s: float  # [m] along the route
     lateral: float  # [m] to the right of the middle of the carriageway
@@ -56,6 +60,8 @@ class Obstacle(NamedTuple):
 
 @dataclass
 class Block:
+    """Block of a map: a piece of the route with its side roads."""
+
     kind: str  # of BLOCKS, or "-" for the straight road between them
     start: Pose  # where the middle of the ego's carriageway enters
     route: list[Segment]  # the ego's carriageway
@@ -92,12 +98,14 @@ class Block:
 
 
 def length(segments: list[Segment]) -> float:
-    """[m]"""
+    """Add up the lengths [m] of segments."""
     return sum(segment.length for segment in segments)
 
 
 def way(kind: str, arm: float, to: float) -> list[Segment]:
     """
+    Find the way through a junction.
+
     :param kind: "O", "T" or "X"
     :param arm: [rad] direction of the arm that one comes from, seen from the middle of the junction
     :param to: [rad] direction of the arm that one leaves by
@@ -177,6 +185,7 @@ class Map:
         self.start = self.blocks[0].start
         segments = [segment for block in self.blocks for segment in block.route]
         self.length = length(segments) - RUN_OUT
+        self.finish = self.length - ARRIVES_BEFORE_END  # [m] along the route
         self.route = sample(self.start, segments)
         self.paths = [Path("route", self.start, segments, shared=(0.0, np.inf)), *self._other_paths()]
         self.obstacles = self._place_obstacles(rng, obstacle_density)
@@ -202,6 +211,8 @@ class Map:
 
     def _is_clear(self, points: np.ndarray, joint: np.ndarray) -> bool:
         """
+        Tell whether new roads keep clear of those that are there.
+
         :param points: along the axes of new roads
         :param joint: where they join the last block; close to it they may be close to each other
         """

@@ -4,7 +4,7 @@ import numpy as np
 
 from sb3_chac.envs.driving.compiled import compiled
 from sb3_chac.envs.driving.corridors import ROUTE_SPACING, route_along
-from sb3_chac.envs.safedrive.geometry import SPACING
+from sb3_chac.envs.driving.geometry import SPACING
 from sb3_chac.envs.safedrive.map import HALF_WIDTH
 
 CHECKPOINTS = np.array([8.0, 16.0, 26.0, 38.0, 50.0])  # [m] ahead on the route
@@ -38,6 +38,8 @@ def locate(route: np.ndarray, s: float, position: np.ndarray, heading: float) ->
 @compiled
 def navigation(route: np.ndarray, s: float, position: np.ndarray, heading: float) -> np.ndarray:
     """
+    Observe the checkpoints ahead.
+
     :param s: [m] along the route
     :param heading: [rad] of the ego
     :return: for each checkpoint its bearing and the heading of the route there, as they are observed, shape (N_NAVIGATION,)

@@ -2,8 +2,8 @@
 
 from typing import TYPE_CHECKING
 
-from sb3_chac.envs.safedrive.env import ARRIVES_BEFORE_END
-from sb3_chac.envs.safedrive.geometry import SPACING, Pose
+from sb3_chac.envs.driving.geometry import SPACING
+from sb3_chac.envs.safedrive.geometry import Pose
 from sb3_chac.envs.safedrive.map import Map
 from sb3_chac.envs.safedrive.roads import areas
 
@@ -23,8 +23,7 @@ def plot_map(road_map: Map, axes: "Axes") -> None:
     """
     from matplotlib.collections import PolyCollection
 
-    finish = road_map.length - ARRIVES_BEFORE_END
-    painted = [area for area in areas(road_map, finish) if area.kind in GREYS]
+    painted = [area for area in areas(road_map, road_map.finish) if area.kind in GREYS]
     colours = [GREYS[area.kind] for area in painted]
     axes.add_collection(
         PolyCollection([area.points for area in painted], facecolors=colours, edgecolors=colours, linewidths=0.2, zorder=1)
@@ -34,7 +33,7 @@ def plot_map(road_map: Map, axes: "Axes") -> None:
         if places:
             axes.plot(*zip(*places, strict=True), marker=marker, color=colour, linestyle="", markersize=3, zorder=2)
     axes.plot(*_on_route(road_map, 0.0, 0.0), marker="o", color="black", markersize=5, zorder=2)
-    axes.plot(*_on_route(road_map, finish, 0.0), marker="*", color="black", markersize=9, zorder=2)
+    axes.plot(*_on_route(road_map, road_map.finish, 0.0), marker="*", color="black", markersize=9, zorder=2)
     axes.autoscale_view()
     axes.set_aspect("equal", adjustable="datalim")
     if not axes.yaxis_inverted():
@@ -45,6 +44,8 @@ def plot_map(road_map: Map, axes: "Axes") -> None:
 
 def _on_route(road_map: Map, s: float, lateral: float) -> tuple[float, float]:
     """
+    Convert coordinates of the route.
+
     :param s: [m] along the route
     :param lateral: [m] to the right of it
     """

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sb3_chac.envs.display import (
+from sb3_chac.envs.driving.display import (
     ASPHALT,
     BLACK,
     FINE,
@@ -19,8 +19,7 @@ from sb3_chac.envs.display import (
     Display,
     turned,
 )  # fmt: skip
-from sb3_chac.envs.safedrive.env import ARRIVES_BEFORE_END
-from sb3_chac.envs.safedrive.geometry import SPACING
+from sb3_chac.envs.driving.geometry import SPACING
 from sb3_chac.envs.safedrive.roads import areas
 from sb3_chac.envs.safedrive.traffic import CRASHED
 
@@ -40,6 +39,8 @@ ARROW, RAY, ECHO = (140, 176, 158), (190, 225, 140), (250, 255, 80)
 
 class Viewer(Display):
     """
+    View of SafeDrive from above.
+
     :param env: the environment to show
     """
 
@@ -73,6 +74,8 @@ class Viewer(Display):
 
     def _on_route(self, s: float) -> np.ndarray:
         """
+        Find a point of the route.
+
         :param s: [m] along the route; beyond its end it goes on straight
         :return: [m], shape (2,)
         """
@@ -82,7 +85,7 @@ class Viewer(Display):
         return np.array([x + rest * np.cos(heading), y + rest * np.sin(heading)])
 
     def _areas(self) -> Iterable[Area]:
-        for area in areas(self.env.map, self.env.map.length - ARRIVES_BEFORE_END):
+        for area in areas(self.env.map, self.env.map.finish):
             yield COLOURS[area.kind], area.points
 
     def _paint_arrows(self) -> None:
@@ -90,7 +93,7 @@ class Viewer(Display):
         shape = np.array([(1.0, 0.0), (-1.0, -3.2), (-2.0, -3.2), (0.0, 0.0), (-2.0, 3.2), (-1.0, 3.2)])
         env = self.env
         for s in (np.ceil(env.s / ARROW_SPACING) + np.arange(1, ARROWS)) * ARROW_SPACING:
-            if s < env.map.length - ARRIVES_BEFORE_END - 2.0:
+            if s < env.map.finish - 2.0:
                 heading = env.map.route[int(s / SPACING), 2]
                 self._polygon(ARROW, self._on_route(s) + shape @ turned(heading))
 

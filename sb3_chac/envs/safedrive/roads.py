@@ -6,7 +6,8 @@ import numpy as np
 from highway_env.road.lane import AbstractLane, CircularLane, LineType, StraightLane
 from highway_env.road.road import RoadNetwork
 
-from sb3_chac.envs.safedrive.geometry import SPACING, Pose, Segment, sample, turn, wrap_angle
+from sb3_chac.envs.driving.geometry import SPACING, wrap_angle
+from sb3_chac.envs.safedrive.geometry import Pose, Segment, sample, turn
 from sb3_chac.envs.safedrive.map import (
     ARM,
     AXIS,
@@ -35,6 +36,8 @@ RIM = AXIS + HALF_WIDTH  # [m] from the axis of a road to its edge
 
 
 class Area(NamedTuple):
+    """Area of a map, to be painted."""
+
     kind: str  # "kerb", "asphalt", "route" (asphalt that the ego may drive on), "grass", "trees", "line" or "black"
     points: np.ndarray  # [m] corners, shape (n, 2)
 
@@ -141,6 +144,8 @@ def _entry(block: Block, arm: float) -> Pose:
 
 def areas(road_map: Map, finish: float) -> list[Area]:
     """
+    Collect the areas of a map.
+
     :param finish: [m] along the route, where the destination is
     :return: what to paint, in this order
     """
@@ -190,6 +195,8 @@ def areas(road_map: Map, finish: float) -> list[Area]:
 
 def along(start: Pose, segments: list[Segment]) -> np.ndarray:
     """
+    Sample poses along a line.
+
     :return: poses every ``SPACING`` and at the end, shape (n, 3)
     """
     end = start
@@ -200,6 +207,8 @@ def along(start: Pose, segments: list[Segment]) -> np.ndarray:
 
 def strip(poses: np.ndarray, left: float, right: float) -> np.ndarray:
     """
+    Make the area between two parallels.
+
     :param poses: shape (n, 3)
     :param left: [m] to the right of the poses, likewise ``right``
     :return: corners of the area between the two, shape (2 n, 2)
@@ -210,6 +219,8 @@ def strip(poses: np.ndarray, left: float, right: float) -> np.ndarray:
 
 def strips(start: Pose, segments: list[Segment], left: float, right: float) -> list[np.ndarray]:
     """
+    Make the area between two parallels in pieces.
+
     :return: pieces, each with its shape (n, 2), of the area between two parallels of a line
     """
     poses = along(start, segments)
@@ -219,6 +230,8 @@ def strips(start: Pose, segments: list[Segment], left: float, right: float) -> l
 
 def dashes(start: Pose, segments: list[Segment], right: float) -> list[np.ndarray]:
     """
+    Make the dashes of a broken line.
+
     :param right: [m] where the broken line is
     """
     poses = along(start, segments)
@@ -292,6 +305,8 @@ def _islands(block: Block) -> list[Area]:
 
 def outline(block: Block, margin: float = 0.0) -> np.ndarray:
     """
+    Make the outline of a junction.
+
     :param margin: [m] that is added around it
     :return: the rim of a junction from arm to arm, shape (n, 2)
     """

@@ -8,7 +8,8 @@ cross or merge, and pull over to the other lane before an obstacle. The loops ov
 import numpy as np
 
 from sb3_chac.envs.driving.compiled import compiled
-from sb3_chac.envs.safedrive.geometry import SPACING, boxes_overlap, sample
+from sb3_chac.envs.driving.geometry import SPACING, boxes_overlap
+from sb3_chac.envs.safedrive.geometry import sample
 from sb3_chac.envs.safedrive.map import LANES, OBSTACLE_SIZES, Map
 
 CAR_LENGTH, CAR_WIDTH = 5.0, 2.0  # [m]
@@ -27,6 +28,8 @@ DECISION_STEPS = 2  # steps between two decisions of the traffic
 
 class Traffic:
     """
+    Traffic on a map.
+
     :param road_map: the map
     :param density: 1 is about one car per 60 m of the route, two at each junction and ramp, and one per 100 m the other way
     :param rng: draws who drives where
@@ -119,6 +122,8 @@ class Traffic:
         self, dt: float, ego_s: float, ego_lateral: float, ego_speed: float, ego_position: np.ndarray, ego_heading: float
     ) -> None:
         """
+        Move all cars by one step.
+
         :param dt: [s]
         :param ego_s: [m] along the route
         :param ego_lateral: [m] to the right of it
@@ -180,6 +185,8 @@ class Traffic:
 
     def _would_hit(self, path, s, lateral, positions, headings) -> np.ndarray:
         """
+        Find the cars that must not move.
+
         :param positions: of the cars before their move, and of the ego
         :return: cars that must not move, as they would touch another one that they do not touch yet
         """
@@ -222,6 +229,8 @@ def _poses(points, first, last, path, s, lateral):
 @compiled
 def _visible(points, first, last, path, s, lateral, state):
     """
+    Find the cars that are there.
+
     :return: indices, positions and headings of the cars of the map that are there
     """
     cars = np.flatnonzero((state == DRIVING) | (state == CRASHED))
@@ -270,6 +279,8 @@ def _pull_over(target, s, lateral, speed, shared, obstacles):
 @compiled
 def _decide(tables, path, s, lateral, speed, positions, headings, desired_speed, waits, obstacle_gaps):
     """
+    Decide how fast each car would go, and where in its lane.
+
     :param tables: arguments of ``_pose``
     :param desired_speed: [m/s], shape (n,)
     :param waits: whether a car still lets others pass, shape (n,)
@@ -337,6 +348,8 @@ def _yields(i, positions, headings, cos, sin, future):
 @compiled
 def _move(s, lateral, speed, target, acceleration, driving, dt):
     """
+    Move the cars.
+
     :return: new s [m], lateral [m] and speed [m/s] of the cars, shape (3, n)
     """
     moved = np.empty((3, len(target)))
@@ -352,6 +365,8 @@ def _move(s, lateral, speed, target, acceleration, driving, dt):
 @compiled
 def _near(positions):
     """
+    Find pairs of vehicles that may touch.
+
     :param positions: of the cars, then of the ego
     :return: the cars, and all others so near to them that they may touch, two arrays of indices
     """

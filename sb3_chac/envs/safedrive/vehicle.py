@@ -29,6 +29,8 @@ class Ego(Vehicle):
 
     def control(self, steering: float, acceleration: float) -> None:
         """
+        Set the controls.
+
         :param steering: in [-1, 1], positive to the right
         :param acceleration: in [-1, 1]
         """
@@ -36,6 +38,8 @@ class Ego(Vehicle):
 
     def slip_at(self, steering: float, speed: float) -> float:
         """
+        Compute the slip angle.
+
         :param steering: [rad]
         :param speed: [m/s]
         :return: [rad] between heading and velocity; it understeers where v^2 sin(slip) / (length / 2) would be above the limit
@@ -49,7 +53,7 @@ class Ego(Vehicle):
 
     @property
     def yaw_rate(self) -> float:
-        """[rad/s]"""
+        """Yaw rate [rad/s], positive to the right."""
         return self.speed * math.sin(self.slip) / (self.LENGTH / 2)
 
     def step(self, dt: float) -> None:

@@ -64,6 +64,8 @@ def things(env: "MetaDriveSafetyEnv") -> Iterator[Thing]:
 
 def _ribbon(points: np.ndarray) -> np.ndarray:
     """
+    Widen a line to a painted one.
+
     :param points: [m] of a line, shape (n, 2), n >= 2
     :return: [m] corners of the painted line, shape (2 n, 2)
     """
@@ -102,6 +104,8 @@ def plot_map(env: "MetaDriveSafetyEnv", axes: "Axes") -> None:
 
 def destination(env: "MetaDriveSafetyEnv") -> np.ndarray:
     """
+    Find the end of the route.
+
     :return: [m] middle of the lane at the end of the route, shape (2,)
     """
     lane = env.ego.navigation.final_lane

@@ -52,6 +52,8 @@ class Display:
 
     def frame(self) -> np.ndarray:
         """
+        Paint the current state.
+
         :return: the picture, shape (height, width, 3), uint8
         """
         self._paint()
@@ -104,6 +106,8 @@ class Display:
 
     def _look(self, position: np.ndarray, heading: float) -> None:
         """
+        Set the view.
+
         :param position: [m] of the ego on the map, y downwards, shape (2,)
         :param heading: [rad] that is to be upwards, clockwise from the x axis
         """
@@ -119,6 +123,8 @@ class Display:
 
     def to_picture(self, points: np.ndarray) -> np.ndarray:
         """
+        Convert positions to pixels.
+
         :param points: [m] on the map, shape (..., 2)
         :return: [px] where they are in the picture painted last, x and y, shape (..., 2)
         """
@@ -132,6 +138,8 @@ class Display:
 
     def _paint_map(self, road_map: Any, areas: Callable[[], Iterable[Area]]) -> None:
         """
+        Paint the areas of the map.
+
         :param road_map: nothing but another one has other areas
         :param areas: painted one upon the other
         """
@@ -194,6 +202,8 @@ class Display:
 
     def _finish(self, info: dict[str, Any], flash: bool) -> None:
         """
+        Add signs of a collision and the panel.
+
         :param info: of the last step
         :param flash: whether a collision is to be seen
         """
@@ -204,12 +214,30 @@ class Display:
 
     def _paint_panel(self, info: dict[str, Any], flash: bool) -> None:
         """
-        The numbers in the corner, and above in the middle what is the matter.
+        The numbers in the corner, unless they are shown elsewhere, and above in the middle what is the matter.
 
         :param info: of the last step
         :param flash: whether a collision is to be seen
         """
         human = bool(self.env.hud.get("takeover"))
+        if getattr(self.env, "panel", True):
+            self._paint_numbers(info, human)
+        state = "collision" if flash else "arrived" if info["arrive_dest"] else "off the road" if info["out_of_road"] else ""
+        state = state or ("human drives" if human and getattr(self.env, "panel", True) else "")
+        if state:
+            colour = EGO if state == "arrived" else HUMAN if state == "human drives" else RED
+            text = self.large_font.render(state, True, BLACK if colour == HUMAN else WHITE)
+            place = text.get_rect(midtop=(SIZE[0] // 2, 20))
+            self.pygame.draw.rect(self.picture, colour, place.inflate(24, 12), border_radius=4)
+            self.picture.blit(text, place)
+
+    def _paint_numbers(self, info: dict[str, Any], human: bool) -> None:
+        """
+        Paint the numbers in the corner.
+
+        :param info: of the last step
+        :param human: whether a person drives
+        """
         rows = {
             "speed": f"{3.6 * info['speed']:.0f} km/h",
             "route": f"{info['route_completion']:.0%}",
@@ -228,14 +256,6 @@ class Display:
             box.blit(name, (18, 9 + i * line_height))
             box.blit(value, (width - 12 - value.get_width(), 9 + i * line_height))
         self.picture.blit(box, PANEL_POSITION)
-        state = "collision" if flash else "arrived" if info["arrive_dest"] else "off the road" if info["out_of_road"] else ""
-        state = state or ("human drives" if human else "")
-        if state:
-            colour = EGO if state == "arrived" else HUMAN if state == "human drives" else RED
-            text = self.large_font.render(state, True, BLACK if colour == HUMAN else WHITE)
-            place = text.get_rect(midtop=(SIZE[0] // 2, 20))
-            self.pygame.draw.rect(self.picture, colour, place.inflate(24, 12), border_radius=4)
-            self.picture.blit(text, place)
 
 
 def _text(value: Any) -> str:

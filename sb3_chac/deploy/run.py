@@ -1,0 +1,285 @@
+"""``python -m sb3_chac run``: an exported policy at the end of a network link. Without torch and Stable-Baselines3."""
+
+import argparse
+import gc
+import math
+import os
+import secrets
+import select
+import signal
+import socket
+import time
+from collections import Counter
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sb3_chac.deploy.gate import Limits
+from sb3_chac.deploy.log import DecisionLog
+from sb3_chac.deploy.metadata import NotDeployable
+from sb3_chac.deploy.policy import OnnxPolicy
+from sb3_chac.deploy.runtime import HOLD_FOR, MAX_SILENCE, Runtime, Step
+from sb3_chac.deploy.udp import (
+    Commanded,
+    Flag,
+    Newest,
+    Observed,
+    RemoteClock,
+    pack_action,
+    received_from,
+    send,
+    unpack_observation,
+)
+
+DESCRIPTION = """Read observations from a vehicle and answer each with an action that the gate has checked, over UDP. The
+packets are described in sb3_chac/deploy/udp.py; docs/guide/deployment.md has the wiring, the states of the gate, what to check
+before the first metre, and what is not guaranteed.
+
+  sb3-chac run policy.onnx --listen 127.0.0.1:5600
+  sb3-chac run policy.onnx --listen 0.0.0.0:5600 --vehicle 192.168.7.2 --log drive.jsonl
+  sb3-chac demos from-log drive.jsonl --dataset drives/monday-v0 --env SafeDrive-v0
+
+Packets are neither encrypted nor authenticated: use a network that nobody else is on."""
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
+    parser = argparse.ArgumentParser(
+        "sb3-chac run", description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("policy", type=Path, metavar="POLICY.onnx", help="a file that 'sb3-chac export' wrote")
+    link = parser.add_argument_group("link")
+    link.add_argument("--listen", default="127.0.0.1:5600", metavar="HOST:PORT", help="(default: %(default)s)")
+    link.add_argument("--vehicle", metavar="HOST", help="take observations from this address only (default: from the first)")
+    link.add_argument("--copies", type=int, default=2, metavar="N", help="of each packet, against loss (default: %(default)s)")
+    gate = parser.add_argument_group("gate")
+    gate.add_argument("--rate", type=float, metavar="HZ", help="decisions per second at least (default: the policy's)")
+    gate.add_argument("--max-age", type=float, metavar="S", help="of an observation (default: .35)")
+    gate.add_argument(
+        "--max-silence", type=float, default=MAX_SILENCE, metavar="S", help="without observations (default: %(default)s)"
+    )
+    gate.add_argument("--deadline", type=float, metavar="S", help="of a decision (default: .05)")
+    gate.add_argument("--hold-for", type=float, default=HOLD_FOR, metavar="S", help="HOLD at most (default: %(default)s)")
+    gate.add_argument(
+        "--brake", metavar="VALUES", help="action that stops, e.g. hold,-1 (default: the policy's); write --brake=-1,hold"
+    )
+    other = parser.add_argument_group("other")
+    other.add_argument("--log", type=Path, metavar="FILE.jsonl", help="write every decision; the file must not be there")
+    other.add_argument("--steps", type=int, metavar="N", help="end after N decisions")
+    other.add_argument("--realtime", action="store_true", help="ask for real-time priority (SCHED_FIFO, Linux)")
+    return parser
+
+
+def main(arguments: list[str]) -> None:
+    """
+    :param arguments: of the command line, after ``run``
+    """
+    parser = make_parser()
+    args = parser.parse_args(arguments)
+    before = signal.signal(signal.SIGTERM, _stop)
+    try:
+        run(args)
+    except (NotDeployable, OSError) as error:
+        parser.exit(2, f"{parser.prog}: error: {error}\n")
+    except KeyboardInterrupt:
+        parser.exit(130, f"{parser.prog}: interrupted\n")
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _stop(signal_number: int, frame: Any) -> None:
+    raise KeyboardInterrupt
+
+
+def run(args: argparse.Namespace) -> None:
+    """
+    :param args: see ``make_parser``
+    :raises NotDeployable: for arguments that do not fit
+    :raises OSError: if a file or the address cannot be used
+    """
+    start = time.perf_counter()
+    host, port = parse_address(args.listen)
+    for option, low in [("copies", 1), ("steps", 1)]:
+        value = getattr(args, option)
+        if value is not None and value < low:
+            raise NotDeployable(f"--{option} must be at least {low}, got {value}.")
+    policy = OnnxPolicy(args.policy)
+    times = {name: getattr(args, name) for name in ("max_age", "max_silence", "deadline", "hold_for")}
+    brake = None if args.brake is None else parse_brake(args.brake)
+    limits = Limits.of(policy.metadata, brake, **{name: value for name, value in times.items() if value is not None})
+    rate = policy.metadata.rate if args.rate is None else args.rate
+    if not (math.isfinite(rate) and rate > 0):
+        raise NotDeployable(f"--rate must be a finite number above 0, got {rate}.")
+    runtime = Runtime(policy, limits)
+    with ExitStack() as stack:
+        sock = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+        sock.bind((host, port))
+        sock.setblocking(False)
+        log = None
+        if args.log is not None:
+            try:
+                log = stack.enter_context(DecisionLog(args.log, policy.metadata))
+            except FileExistsError as error:
+                raise NotDeployable(f"--log {args.log}: the file is there already, choose another name.") from error
+        if args.realtime:
+            ask_for_priority()
+        allowed = None if args.vehicle is None else socket.gethostbyname(args.vehicle)
+        server = PolicyServer(runtime, sock, 1 / rate, args.copies, allowed, log)
+        address = ":".join(map(str, sock.getsockname()))
+        metadata = policy.metadata
+        print(f"{args.policy}: {metadata.algorithm}, {len(metadata.layout)} described parts of an observation", flush=True)
+        print(f"Ready on {address} after {time.perf_counter() - start:.2f} s; waiting for a vehicle", flush=True)
+        # What there is now stays: no pause of the garbage collector while the vehicle drives
+        gc.collect()
+        gc.freeze()
+        gc.disable()
+        try:
+            server.serve(args.steps)
+        finally:
+            gc.enable()
+            print(server.summary(), flush=True)
+
+
+class PolicyServer:
+    """
+    The policy's end of the link.
+
+    :param runtime: decides
+    :param sock: bound UDP socket that does not block
+    :param period: [s] after which a decision is made though no observation has come
+    :param copies: of each packet
+    :param allowed: address of the vehicle, None for the first one that sends an observation
+    :param log: of decisions, None for none
+    """
+
+    def __init__(
+        self,
+        runtime: Runtime,
+        sock: Any,
+        period: float,
+        copies: int = 2,
+        allowed: str | None = None,
+        log: DecisionLog | None = None,
+    ) -> None:
+        self.runtime, self.sock, self.period, self.copies, self.log = runtime, sock, period, copies, log
+        self.allowed = allowed
+        self.vehicle: Any = None
+        self.session, self.sequence = secrets.randbits(32), 0
+        self.last: Observed | None = None
+        self.states: Counter[str] = Counter()
+        self.latencies: list[float] = []
+        self._newest, self._remote = Newest(), RemoteClock()
+
+    def serve(self, steps: int | None = None) -> None:
+        """
+        Decide until ``steps`` decisions are made, or forever.
+        """
+        due = self.runtime.clock() + self.period
+        while steps is None or self.sequence < steps:
+            wait = due - self.runtime.clock()
+            if wait > 0:
+                select.select([self.sock], [], [], wait)
+            packet = self.receive()
+            now = self.runtime.clock()
+            if packet is None and (now < due or self.vehicle is None):
+                due = due if now < due else now + self.period
+                continue
+            self.answer(packet, now)
+            due = now + self.period
+
+    def receive(self) -> Observed | None:
+        """
+        :return: the newest observation that waits, None if there is none
+        """
+        newest = None
+        for data, sender in received_from(self.sock):
+            if sender[0] != (self.allowed or (self.vehicle or sender)[0]):
+                continue
+            packet = unpack_observation(data, self.runtime.policy.metadata.inputs)
+            if packet is not None and self._newest.is_new(packet.session, packet.sequence):
+                if packet.session != (self.last or packet).session:
+                    self._remote = RemoteClock()
+                newest, self.vehicle = packet, sender
+                self.last = packet
+        return newest
+
+    def answer(self, packet: Observed | None, now: float) -> Step:
+        """
+        Decide and send the action.
+
+        :param packet: the observation, None if none has come in time
+        :param now: [s] of the runtime's clock
+        """
+        last = packet or self.last
+        flags = Flag.NONE if last is None else last.flags
+        step = self.runtime.decide(
+            None if packet is None else packet.observation,
+            0.0 if packet is None else self._remote.age(packet.stamp, now),
+            override=bool(flags & Flag.OVERRIDE),
+            guided_only=bool(flags & Flag.GUIDED_ONLY),
+            resume=packet is not None and bool(flags & Flag.RESUME),
+        )
+        decision, proposal = step.decision, step.proposal
+        command = Commanded(
+            self.session,
+            self.sequence,
+            0 if last is None else last.sequence,
+            math.nan if last is None else last.stamp,
+            decision.state,
+            decision.faults,
+            decision.action,
+            decision.engaged,
+            None if proposal is None else proposal.self_drives,
+            math.nan if proposal is None or proposal.confidence is None else proposal.confidence,
+            step.given.latency,
+        )
+        self.sequence += 1
+        data = pack_action(command)
+        for _ in range(self.copies):
+            send(self.sock, data, self.vehicle)
+        self.states[decision.state.name] += 1
+        if packet is not None:
+            self.latencies.append(step.given.latency)
+        if self.log is not None:
+            self.log.add(step, packet)
+        return step
+
+    def summary(self) -> str:
+        """Return how often each state occurred, and how long decisions took."""
+        if not self.latencies:
+            return "No observation has come."
+        counts = ", ".join(f"{name} {count}" for name, count in self.states.most_common())
+        median, worst = 1e3 * np.quantile(self.latencies, [0.5, 0.999])
+        return f"{self.sequence} decisions: {counts}. They took {median:.2f} ms, {worst:.2f} ms at the 99.9th percentile."
+
+
+def parse_address(text: str) -> tuple[str, int]:
+    """
+    :param text: HOST:PORT
+    :raises NotDeployable: for anything else
+    """
+    host, _, port = text.rpartition(":")
+    if not host or not port.isdigit() or int(port) > 65535:
+        raise NotDeployable(f"--listen must be HOST:PORT, such as 0.0.0.0:5600, got {text!r}.")
+    return host, int(port)
+
+
+def parse_brake(text: str) -> list[float | None]:
+    """
+    :param text: numbers, or "hold" for what keeps its value
+    :raises NotDeployable: for anything else
+    """
+    try:
+        return [None if part.strip() == "hold" else float(part) for part in text.split(",")]
+    except ValueError as error:
+        raise NotDeployable(f"--brake must be numbers and 'hold', such as hold,-1, got {text!r}.") from error
+
+
+def ask_for_priority() -> None:
+    """Run before all that is not real-time, where the operating system lets us; print that it does not."""
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(10))
+    except (AttributeError, OSError) as error:
+        print(f"--realtime: not permitted ({error}), going on without", flush=True)

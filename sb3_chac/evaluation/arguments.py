@@ -1,0 +1,50 @@
+"""Arguments of the command line that several commands share."""
+
+import ast
+from pathlib import Path
+from typing import Any
+
+from sb3_chac.evaluation.episodes import NotEvaluable
+
+
+def check_output(option: str, path: Path | None, suffixes: tuple[str, ...] = ()) -> None:
+    """
+    Check before the work begins that a file can be written.
+
+    :param option: for the message
+    :param path: file that is to be written at the end, None if none
+    :param suffixes: those possible, all if empty
+    :raises FileNotFoundError: if its folder does not exist
+    :raises NotEvaluable: if it cannot be written, or has another suffix
+    """
+    if path is None:
+        return
+    if suffixes and path.suffix not in suffixes:
+        raise NotEvaluable(f"{option} {path}: the file name must end with {' or '.join(suffixes)}.")
+    if not path.parent.is_dir():
+        raise FileNotFoundError(f"{option} {path}: the folder {path.parent} does not exist, create it first.")
+    existed = path.exists()
+    try:
+        path.open("ab").close()
+    except OSError as error:
+        raise NotEvaluable(f"{option} {path}: cannot be written ({error.strerror}).") from error
+    if not existed:
+        path.unlink()
+
+
+def parse_env_kwargs(pairs: list[str]) -> dict[str, Any]:
+    """
+    Parse pairs of key and value.
+
+    :param pairs: such as "density:0.1"
+    :raises NotEvaluable: unless each has a key and a Python literal
+    """
+    result = {}
+    for pair in pairs:
+        key, _, value = pair.partition(":")
+        try:
+            result[key] = ast.literal_eval(value)
+        except (ValueError, SyntaxError) as error:
+            hint = "must look like key:value with a Python literal, e.g. density:0.1 or name:\"'text'\""
+            raise NotEvaluable(f"--env-kwargs {hint}, got {pair!r}.") from error
+    return result
