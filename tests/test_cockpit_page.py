@@ -22,8 +22,12 @@ from sb3_chac.cockpit.meter import CALM, LEAST, GuidanceMeter
 from sb3_chac.cockpit.session import Display, Novice, asks_for_help, indicators, who_drives
 
 needs_chromium = pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium")
-PHONES = [(390, 844), (844, 390), (360, 640), (640, 360)]
-SCREENS = [(800, 600), (1280, 800), (1920, 1080), (2560, 1440)]
+# Whether there is a touch screen, sizes
+SIZES = [(True, [(390, 844), (844, 390)]), (False, [(800, 600), (1280, 800), (1920, 1080)])]
+MORE_SIZES = [
+    (True, [(360, 640), (640, 360), (1024, 768), (768, 1024)]),
+    (False, [(360, 640), (640, 360), (390, 844), (844, 390), (2560, 1440)]),
+]
 LOOKED_AT = os.environ.get("SB3_CHAC_SCREENSHOTS")  # a folder, for those who want to look
 
 
@@ -284,13 +288,14 @@ def shows(page, element, text):
 
 
 @needs_chromium
-def test_nothing_overlaps_or_leaves_the_view_in_any_size(served):
+@pytest.mark.parametrize("all_sizes", [SIZES, pytest.param(MORE_SIZES, marks=pytest.mark.slow)], ids=["few", "more"])
+def test_nothing_overlaps_or_leaves_the_view_in_any_size(served, all_sizes):
     """With the longest values. Help and options fit as well, and are closed at first."""
     novice = Novice("2: self-learning", True, 0.97, 1.0, True)
     numbers = {"total_steps": 1_234_567, "human_steps": 1_234_567, "seconds": 123_456.0, "cost": 1234.5, "collisions": 3}
     served.drive.lag = 123_456
     with chromium() as browser:
-        for sizes, touch in ((PHONES, True), (SCREENS, False), ([(1024, 768), (768, 1024)], True), (PHONES, False)):
+        for touch, sizes in all_sizes:
             context = {
                 "has_touch": touch,
                 "is_mobile": touch,

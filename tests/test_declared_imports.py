@@ -56,8 +56,9 @@ def test_all_imported_packages_are_declared():
 
 
 def test_what_is_declared_for_an_import_brings_it():
+    installed = importlib.metadata.packages_distributions()
     for name in ("numpy", "torch", "rliable", "matplotlib", "imageio", "rl_zoo3", "highway_env", "huggingface_sb3", "PIL"):
-        assert normal(DISTRIBUTIONS.get(name, name)) in map(normal, importlib.metadata.packages_distributions()[name])
+        assert normal(DISTRIBUTIONS.get(name, name)) in map(normal, installed[name])
 
 
 def test_no_message_names_an_installation_that_does_not_exist():

@@ -6,8 +6,8 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import sb3_chac.envs  # noqa: F401
+from sb3_chac.envs.driving.geometry import SPACING
 from sb3_chac.envs.roadtest.env import CHECKPOINTS, KERB, KINDS, ROUTES
-from sb3_chac.envs.safedrive.geometry import SPACING
 
 
 def make(**kwargs):
@@ -81,6 +81,7 @@ def test_who_crosses_is_seen_and_can_be_hit():
     assert max(nearest) > 0.8 and nearest[5] < nearest[15]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("route", [1, 2])
 def test_the_scripted_driver_stops_for_people(route):
     """Compared with the one who does not see them."""

@@ -7,9 +7,11 @@ import numpy as np
 from gymnasium import spaces
 
 from sb3_chac.common.checks import check_integer, check_range
-from sb3_chac.envs.safedrive.driver import IMPERFECTIONS, Others, ScriptedDriver
+from sb3_chac.envs.driving.geometry import SPACING, boxes_overlap
+from sb3_chac.envs.driving.planner import Others
+from sb3_chac.envs.safedrive.driver import IMPERFECTIONS, ScriptedDriver
 from sb3_chac.envs.safedrive.env import SafeDriveEnv, Scene
-from sb3_chac.envs.safedrive.geometry import SPACING, Pose, boxes_overlap
+from sb3_chac.envs.safedrive.geometry import Pose
 from sb3_chac.envs.safedrive.map import HALF_WIDTH, length
 from sb3_chac.envs.safedrive.vehicle import MAX_SPEED
 
