@@ -70,17 +70,21 @@ def main() -> None:
         print(USAGE)
         return
     if command not in COMMANDS:
-        sys.exit(f"{USAGE}\n\nsb3-chac: {command!r} is not a command, choose from {', '.join(COMMANDS)}.")
+        known = ", ".join(COMMANDS)
+        sys.stderr.write(f"sb3-chac: error: {command!r} is not a command, choose from {known} (sb3-chac --help).\n")
+        sys.exit(2)
     if command in OWN_COMMANDS:
         import_module(OWN_COMMANDS[command]).main(import_packages(command, sys.argv[2:]))
         return
 
     from sb3_chac.zoo import register
+    from sb3_chac.zoo.stopping import one_sentence
 
-    register()
-    from rl_zoo3.cli import main as zoo_main  # takes the commands as they are now
+    with one_sentence(f"sb3-chac {command}"):
+        register()
+        from rl_zoo3.cli import main as zoo_main  # takes the commands as they are now
 
-    zoo_main()
+        zoo_main()
 
 
 if __name__ == "__main__":

@@ -105,7 +105,7 @@ def run(args: argparse.Namespace) -> None:
     :raises FileNotFoundError: if the model, or the folder of an output file, does not exist
     :raises NotEvaluable: for whatever else does not fit, found before the episodes run
     """
-    args.env = args.env or env_of(args.model)
+    args.env = env_of(args.model) if args.env is None else args.env
     check_output("--json", args.json)
     check_output("--steps", args.steps, (".csv",))
     check_output("--plot", args.plot, pictures.PLOT_SUFFIXES)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from sb3_chac.zoo import register
 from sb3_chac.zoo.runs import NotResumable, find_training, steps
+from sb3_chac.zoo.stopping import one_sentence
 
 DESCRIPTION = """Go on with a training that was interrupted or killed (kill -9, a power cut), from its newest checkpoint.
 
@@ -47,8 +48,9 @@ def main(arguments: list[str]) -> None:
         import_module("sb3_chac.drive").main(["--resume", str(run_folder)])
         return
 
-    register()
-    from rl_zoo3.train import train
+    with one_sentence("sb3-chac resume"):
+        register()
+        from rl_zoo3.train import train
 
-    sys.argv[1:] = [*command, "-i", str(model)]
-    train()
+        sys.argv[1:] = [*command, "-i", str(model)]
+        train()

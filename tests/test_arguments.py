@@ -68,7 +68,7 @@ def required(owner):
     return {name: value for name, value in found.items() if name in parameters}
 
 
-def bad_values(owner):
+def bad_values(owner, values=VALUES):
     """
     :return: names of arguments, and values that they cannot have
     """
@@ -76,7 +76,7 @@ def bad_values(owner):
     for name in inspect.signature(owner).parameters:
         if name in NOT_CHECKED:
             continue
-        for label, value in VALUES.items():
+        for label, value in values.items():
             may_be = hints.get(name) is not typing.Any and fits(value, hints.get(name))
             if name in GOOD.get(label, ()) and may_be:
                 continue

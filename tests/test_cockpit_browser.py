@@ -144,6 +144,7 @@ async def state_of(channel, wanted=lambda state: True):
     """The first state that is wanted."""
     while True:
         message = await asyncio.wait_for(channel.receive(), FOREVER)
+        assert not channel.closed
         if message.type is aiohttp.WSMsgType.TEXT and wanted(state := json.loads(message.data)):
             return state
 

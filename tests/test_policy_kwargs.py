@@ -90,6 +90,27 @@ def test_a_target_entropy_may_count_actions(name):
         make_any(name, Walk(), target_entropy="auto-8")
 
 
+@pytest.mark.parametrize("name", [name for name in ALL if name not in (*IMITATING, *ON_POLICY, "CQL")])
+def test_an_agent_that_was_published_without_its_critics_does_not_learn(name):
+    model = make_any(name, Walk())
+    with th.no_grad():
+        for parameter in model.policy.critic.parameters():
+            parameter.zero_()
+    model.predict(np.zeros(2))
+    with pytest.raises(ValueError, match=r"^policy: the critics of this"):
+        model.learn(10)
+    assert model.num_timesteps == 0
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_a_model_is_loaded_with_the_arguments_that_it_was_made_with(name, tmp_path):
+    kwargs = {"features_extractor_kwargs": {}}
+    make_any(name, Walk(), policy_kwargs=dict(kwargs)).save(tmp_path / "model")
+    given = kwargs | ({"use_sde": False} if name in ("DSAC", "DPVP", "CHAC", "SACLag") else {})  # SB3 adds this one
+    model = getattr(sb3_chac, name).load(tmp_path / "model", policy_kwargs=given)
+    assert all(key in given for key in model.policy_kwargs)
+
+
 def test_cql_without_the_conservative_term():
     model = make_any("CQL", Walk(), conservative_weight=0.0).learn(5)
     assert all(value.isfinite().all() for value in model.policy.state_dict().values())

@@ -151,7 +151,7 @@ def dpvp_loss(model, batch, seed, pv_coef=1.0, differ=None, td=None, eta=1.0, et
 
 def update_proxy_critic(model, batch, seed=0):
     th.manual_seed(seed)
-    return model._update_critic(batch, model.log_ent_coef.detach().exp())
+    return model._update_critic(batch, model._current_ent_coef())
 
 
 @pytest.mark.parametrize(

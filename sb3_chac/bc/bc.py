@@ -13,7 +13,7 @@ from sb3_chac.common.arguments import checked
 from sb3_chac.common.checks import check_range
 from sb3_chac.common.demonstrations import Dataset
 from sb3_chac.common.offline import Batch, OfflineAlgorithm
-from sb3_chac.common.utils import minimize
+from sb3_chac.common.utils import minimize, policy_arguments
 
 SelfBC = TypeVar("SelfBC", bound="BC")
 
@@ -92,14 +92,15 @@ class BC(OfflineAlgorithm):
         )
         self.loss = loss
         self.weight_decay = weight_decay
-        self.policy_kwargs = {**self.policy_kwargs, "stochastic": loss == "nll"}
 
         if _init_setup_model:
             self._setup_model()
             self.set_dataset(dataset)
 
     def _setup_model(self) -> None:
-        super()._setup_model()
+        self.policy_kwargs = {key: value for key, value in self.policy_kwargs.items() if key != "stochastic"}  # once stored
+        with policy_arguments(self, stochastic=self.loss == "nll"):
+            super()._setup_model()
         for group in self.policy.optimizer.param_groups:
             group["weight_decay"] = self.weight_decay
 

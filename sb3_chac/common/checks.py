@@ -35,7 +35,8 @@ def check_action_space(action_space: spaces.Space) -> None:
     if not np.all(np.isfinite(action_space.low) & np.isfinite(action_space.high) & (action_space.low < action_space.high)):
         raise UnsupportedActionSpace(
             f"env: the action space must have finite bounds with low < high, got {action_space}. "
-            "Wrap the environment, e.g. in gymnasium.wrappers.RescaleAction or ClipAction."
+            "Give the environment's action_space finite bounds, and leave out gymnasium.wrappers.ClipAction, which takes them "
+            "away: no action leaves them."
         )
 
 

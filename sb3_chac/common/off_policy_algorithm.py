@@ -79,10 +79,22 @@ class CheckedOffPolicyAlgorithm(OffPolicyAlgorithm):
         progress_bar: bool = False,
     ) -> tuple[int, BaseCallback]:
         assert self.env is not None
+        self._check_critics()
         keep_last_observations(self.env)
         prepared = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
         check_reset(self._last_obs, self._vec_normalize_env, self.num_timesteps)  # type: ignore[arg-type]
         return prepared
+
+    def _check_critics(self) -> None:
+        """
+        :raises ValueError: if the critics are zeros, as in the agents of benchmarks/agents, which are published without them
+        """
+        critic = getattr(self.policy, "critic", None)
+        if critic is not None and not any(parameter.any() for parameter in critic.parameters()):
+            raise ValueError(
+                f"policy: the critics of this {type(self).__name__} are all zeros: it was published to act, without what only "
+                "learns, and cannot go on learning. Evaluate it, or train a new one."
+            )
 
     def _store_transition(
         self,

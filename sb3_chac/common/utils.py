@@ -4,9 +4,11 @@ import math
 import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import numpy as np
 import torch as th
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.distributions import Distribution
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.utils import get_parameters_by_name
@@ -131,6 +133,22 @@ def target_entropy(argument: str | float, n_actions: int) -> float:
     if matched is None:
         raise ValueError(f"target_entropy must be a number, 'auto' or such as 'auto_8' (-8 per action), got {argument!r}.")
     return -float(matched[1] or 1) * n_actions
+
+
+@contextmanager
+def policy_arguments(model: BaseAlgorithm, **defaults: Any) -> Iterator[None]:
+    """
+    Add arguments to those of the policy inside the block, where it is built. They are not stored with the model: SB3's
+    ``load`` compares what is stored with what is given to it.
+
+    :param defaults: arguments; those that ``policy_kwargs`` holds go first
+    """
+    given = model.policy_kwargs
+    model.policy_kwargs = {**defaults, **given}
+    try:
+        yield
+    finally:
+        model.policy_kwargs = given
 
 
 def safe_log(value: float) -> float:

@@ -260,9 +260,11 @@ class CQL(OfflineAlgorithm):
             following, following_log_prob = self._draw_actions(batch.next_observations)
             actions = th.cat([uniform, current, following], dim=1)
             log_densities = th.cat([uniform_log_density, current_log_prob, following_log_prob], dim=1)
-        observations = batch.observations.repeat_interleave(3 * n, dim=0)
-        q_values = self.critic(observations, actions.flatten(end_dim=1))
-        return th.stack([values.view(size, 3 * n) for values in q_values]), log_densities
+        # Features once for all actions (a shared extractor is learned by the actor's loss alone, as in SB3's SAC)
+        with th.set_grad_enabled(not self.critic.share_features_extractor):
+            features = self.critic.extract_features(batch.observations, self.critic.features_extractor)
+        inputs = th.cat([features.repeat_interleave(3 * n, dim=0), actions.flatten(end_dim=1)], dim=1)
+        return th.stack([q_net(inputs).view(size, 3 * n) for q_net in self.critic.q_networks]), log_densities
 
     def _draw_actions(self, observations: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """

@@ -46,7 +46,7 @@ def find_algorithm(path: Path, algo: str | None) -> tuple[Path, str, type[BaseAl
     add_algorithms(utils)
     if algo is not None and algo not in utils.ALGOS:
         raise NotEvaluable(f"--algo {algo!r} is not known, choose from {', '.join(sorted(utils.ALGOS))}.")
-    if not path.is_file() and path.with_name(path.name + ".zip").is_file():
+    if not path.is_file() and path.name and path.with_name(path.name + ".zip").is_file():
         path = path.with_name(path.name + ".zip")
     if not path.is_file():
         raise FileNotFoundError(f"There is no model {path}.")

@@ -19,7 +19,7 @@ from sb3_chac.common.buffers import DualReplayBuffer, TransitionStore
 from sb3_chac.common.checks import check_integer, check_range
 from sb3_chac.common.demonstrations import Dataset, check_spaces
 from sb3_chac.common.guided import GuidedOffPolicyAlgorithm
-from sb3_chac.common.utils import fix_statistics, minimize
+from sb3_chac.common.utils import fix_statistics, minimize, policy_arguments
 
 SelfHGDagger = TypeVar("SelfHGDagger", bound="HGDagger")
 
@@ -115,7 +115,7 @@ class HGDagger(GuidedOffPolicyAlgorithm):
             replay_buffer_kwargs=replay_buffer_kwargs,
             stats_window_size=stats_window_size,
             tensorboard_log=tensorboard_log,
-            policy_kwargs={**(policy_kwargs or {}), "stochastic": loss == "nll"},
+            policy_kwargs=policy_kwargs,
             verbose=verbose,
             device=device,
             support_multi_env=True,
@@ -139,7 +139,9 @@ class HGDagger(GuidedOffPolicyAlgorithm):
                 self.store_demonstrations(dataset)
 
     def _setup_model(self) -> None:
-        super()._setup_model()
+        self.policy_kwargs = {key: value for key, value in self.policy_kwargs.items() if key != "stochastic"}  # once stored
+        with policy_arguments(self, stochastic=self.loss == "nll"):
+            super()._setup_model()
         for group in self.policy.optimizer.param_groups:
             group["weight_decay"] = self.weight_decay
 

@@ -13,7 +13,7 @@ from sb3_chac.common.arguments import checked
 from sb3_chac.common.buffers import DualReplayBuffer, DualReplayBufferSamples, take_rows
 from sb3_chac.common.checks import check_integer, check_range
 from sb3_chac.common.guided import GuidedOffPolicyAlgorithm
-from sb3_chac.common.utils import frozen, minimize
+from sb3_chac.common.utils import frozen, minimize, policy_arguments
 
 SelfPVP = TypeVar("SelfPVP", bound="PVP")
 
@@ -128,7 +128,7 @@ class PVP(GuidedOffPolicyAlgorithm, TD3):
             target_noise_clip=target_noise_clip,
             stats_window_size=stats_window_size,
             tensorboard_log=tensorboard_log,
-            policy_kwargs={"net_arch": [256, 256], **(policy_kwargs or {})},
+            policy_kwargs=policy_kwargs,
             verbose=verbose,
             seed=seed,
             device=device,
@@ -141,6 +141,10 @@ class PVP(GuidedOffPolicyAlgorithm, TD3):
 
         if _init_setup_model:
             self._setup_model()
+
+    def _setup_model(self) -> None:
+        with policy_arguments(self, net_arch=[256, 256]):
+            super()._setup_model()
 
     def _check_arguments(self) -> None:
         super()._check_arguments()

@@ -1,6 +1,7 @@
 """Mistakes on RL-Zoo3's command line and in its yaml files: one line each, in place of a traceback."""
 
 import argparse
+import importlib.util
 import math
 import os
 import sys
@@ -62,10 +63,21 @@ def check_options(args: Any) -> None:
         value = getattr(args, name, low)
         if value is not None and value < low:
             raise ValueError(f"--{name.replace('_', '-')} must be at least {low}, got {value}.")
+    config = getattr(args, "conf_file", None)
+    if config and Path(config).suffix not in (".yml", ".yaml", ".py") and not is_module(config):
+        raise ValueError(f"--conf-file must be a .yml file, or a Python module, got {config!r}.")
     for name in ("trained_agent", "conf_file"):
         value = getattr(args, name, None)
         if value and Path(value).suffix in (".zip", ".yml", ".yaml", ".py") and not Path(value).is_file():
             raise ValueError(f"--{name.replace('_', '-')}: there is no file {value}.")
+
+
+def is_module(name: str) -> bool:
+    """Return whether there is a Python module of this name."""
+    try:
+        return importlib.util.find_spec(name) is not None
+    except (ImportError, ValueError):
+        return False
 
 
 def check_file(config: str, env_id: str) -> None:

@@ -1,5 +1,7 @@
 """What RL-Zoo3 has to be told of our algorithms, and gymnasium of our environments."""
 
+import contextlib
+import functools
 import importlib
 import os
 import sys
@@ -7,6 +9,7 @@ from types import ModuleType
 
 import sb3_chac
 from sb3_chac.zoo.algorithms import ALGORITHMS
+from sb3_chac.zoo.stopping import check_threads, known_options, one_sentence
 
 
 def register() -> None:
@@ -61,15 +64,28 @@ def add_training(train: ModuleType) -> None:
     """
     Extend RL-Zoo3's training command.
 
-    :param train: ``rl_zoo3.train``, whose command ends in one line for what is wrong with its arguments
+    :param train: ``rl_zoo3.train``, whose command ends in one line for what is wrong with its arguments, and with one sentence
+        when it is stopped before our algorithms, or others in our environments, learn
     """
+    from sb3_chac.envs import ENVIRONMENTS
     from sb3_chac.zoo.errors import one_line
 
-    command = train.train
     if "--gym-packages" in sys.argv and os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())  # where a user's own environment may be
-    if not hasattr(command, "__wrapped__"):
-        train.train = one_line(ValueError, AssertionError, ImportError, OSError)(command)  # type: ignore[attr-defined]
+    command = train.train
+    if hasattr(command, "__wrapped__"):
+        return
+
+    @functools.wraps(command)
+    def checked_command() -> None:
+        options = known_options(sys.argv[1:])
+        is_ours = options.algo in ALGORITHMS or options.env in ENVIRONMENTS
+        with one_sentence("rl_zoo3 train") if is_ours else contextlib.nullcontext():
+            with one_line(ValueError, AssertionError, ImportError, OSError):
+                check_threads(options.num_threads)
+                command()
+
+    train.train = checked_command  # type: ignore[attr-defined]
 
 
 def add_metadata(push_to_hub: ModuleType) -> None:
