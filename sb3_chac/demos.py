@@ -119,6 +119,8 @@ def main(arguments: list[str]) -> None:
 
 def run_from_log(args: argparse.Namespace) -> None:
     """
+    Make a dataset of a log of decisions.
+
     :param args: see ``make_parser``
     :raises ValueError: if the log does not fit (``NotDeployable``, ``DatasetError``, ``NotEvaluable``)
     """

@@ -87,6 +87,8 @@ class CheckedOffPolicyAlgorithm(OffPolicyAlgorithm):
 
     def _check_critics(self) -> None:
         """
+        Check that a model can go on learning.
+
         :raises ValueError: if the critics are zeros, as in the agents of benchmarks/agents, which are published without them
         """
         critic = getattr(self.policy, "critic", None)

@@ -69,6 +69,8 @@ def episodes_of(decisions: Iterator[dict[str, Any]]) -> Iterator[list[dict[str, 
 
 def episode_of(lines: list[dict[str, Any]], env: gym.Env) -> "EpisodeBuffer":
     """
+    Convert the lines of a log to an episode.
+
     :param lines: of one episode
     :return: the episode as Minari stores it, the infos of an action at the index of what followed it
     """

@@ -78,6 +78,8 @@ class SimulatedSocket:
 
     def recvfrom(self, size: int) -> tuple[bytes, Any]:
         """
+        Receive a packet.
+
         :raises BlockingIOError: if nothing has arrived
         """
         self._arrived += self.incoming.ready(self.clock())
@@ -110,6 +112,8 @@ class DegradedSocket:
 
     def recvfrom(self, size: int) -> tuple[bytes, Any]:
         """
+        Receive a packet.
+
         :raises BlockingIOError: if nothing has arrived
         """
         self._flush()

@@ -42,6 +42,8 @@ class DecisionLog:
 
     def add(self, step: Step, packet: Observed | None = None) -> None:
         """
+        Write one decision.
+
         :param step: of a ``Runtime``
         :param packet: in which its observation came, None if there was none
         """
@@ -96,6 +98,8 @@ def finite(number: float) -> float | None:
 
 def read_log(file: Path) -> tuple[Metadata, Iterator[dict[str, Any]]]:
     """
+    Read a log of decisions.
+
     :return: what the policy's file told, and the decisions, with their observations as arrays. A last line that was not
         finished is left out
     :raises NotDeployable: for another file

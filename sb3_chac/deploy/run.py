@@ -74,6 +74,8 @@ def make_parser() -> argparse.ArgumentParser:
 
 def main(arguments: list[str]) -> None:
     """
+    Run the command.
+
     :param arguments: of the command line, after ``run``
     """
     parser = make_parser()
@@ -95,6 +97,8 @@ def _stop(signal_number: int, frame: Any) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """
+    Serve a policy as the command line says.
+
     :param args: see ``make_parser``
     :raises NotDeployable: for arguments that do not fit
     :raises OSError: if a file or the address cannot be used
@@ -191,6 +195,8 @@ class PolicyServer:
 
     def receive(self) -> Observed | None:
         """
+        Receive the newest observation.
+
         :return: the newest observation that waits, None if there is none
         """
         newest = None
@@ -257,6 +263,8 @@ class PolicyServer:
 
 def parse_address(text: str) -> tuple[str, int]:
     """
+    Parse an address.
+
     :param text: HOST:PORT
     :raises NotDeployable: for anything else
     """
@@ -268,6 +276,8 @@ def parse_address(text: str) -> tuple[str, int]:
 
 def parse_brake(text: str) -> list[float | None]:
     """
+    Parse the action that brakes.
+
     :param text: numbers, or "hold" for what keeps its value
     :raises NotDeployable: for anything else
     """

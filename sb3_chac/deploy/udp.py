@@ -88,6 +88,8 @@ class Commanded(NamedTuple):
 
 def pack_observation(packet: Observed, inputs: Sequence[Input]) -> bytes:
     """
+    Pack an observation.
+
     :param inputs: of the policy
     :raises NotDeployable: if the observation does not fit them, or into a packet
     """
@@ -108,6 +110,8 @@ def pack_observation(packet: Observed, inputs: Sequence[Input]) -> bytes:
 
 def unpack_observation(data: bytes, inputs: Sequence[Input]) -> Observed | None:
     """
+    Unpack an observation.
+
     :param inputs: of the policy
     :return: None for anything but an intact observation packet of such a policy
     """
@@ -140,6 +144,8 @@ def pack_action(packet: Commanded) -> bytes:
 
 def unpack_action(data: bytes) -> Commanded | None:
     """
+    Unpack an action.
+
     :return: None for anything but an intact action packet
     """
     if not _is_intact(data, ACTION, _ACTION):
@@ -203,6 +209,8 @@ class RemoteClock:
 
     def age(self, stamp: float, now: float) -> float:
         """
+        Estimate the age of a packet.
+
         :param stamp: [s] of the sender's clock
         :param now: [s] of ours, when the packet arrived
         :return: [s] at least 0; NaN if the stamp is not finite

@@ -42,6 +42,8 @@ def one_sentence(command: str) -> Iterator[None]:
 
 def known_options(arguments: Sequence[str]) -> argparse.Namespace:
     """
+    Read the options that matter before the training is set up.
+
     :param arguments: of ``rl_zoo3 train``
     :return: algorithm, environment and number of threads, as text
     """
@@ -56,6 +58,8 @@ def known_options(arguments: Sequence[str]) -> argparse.Namespace:
 
 def check_threads(value: str) -> None:
     """
+    Check the number of threads.
+
     :param value: of ``--num-threads``
     :raises ValueError: for a number of threads that no machine has: OpenMP would end the process without a word
     """

@@ -192,6 +192,8 @@ class RoadTestEnv(SafeDriveEnv):
 
     def scan(self) -> tuple[np.ndarray, np.ndarray]:
         """
+        Cast the lidar's rays.
+
         :return: [m] distances along the lidar's rays, people included, shape (240,), and indices of the other boxes that can
             be seen
         """
@@ -224,6 +226,8 @@ class RoadTestEnv(SafeDriveEnv):
 
     def scripted_driver(self, name: str = "scripted") -> ScriptedDriver:
         """
+        Make a driver by its name.
+
         :param name: "scripted" (with a human's imperfections) or "scripted-ideal" (without)
         :return: a driver for this environment, who sees the people
         :raises ValueError: for another name
