@@ -52,7 +52,7 @@ RESULTS = {
 SIMULATORS = {"SafeDrive-v0": "highway-env", "MetaDriveSafety-v0": "metadrive-simulator"}
 TEST_MAPS, TUNING_MAPS = range(1000, 1200), range(2000, 2200)
 FIRST_TUNING_SEED = 100
-GUIDED, SWITCH = 50_000, 10_000  # steps of D-PVP, and of C-HAC's stage 1
+GUIDED, SWITCH = 50_000, 20_000  # steps of D-PVP, and of C-HAC's stage 1
 AFTER_SWITCH = 50_000  # steps that the ablations are compared over
 
 

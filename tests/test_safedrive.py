@@ -157,18 +157,6 @@ def test_reward_adds_up(env):
     assert rewards.sum() == pytest.approx(expected, abs=1e-6)
 
 
-def test_careful_driver_arrives_at_8_metres_per_second(env):
-    env.reset(options={"scenario": 2000})
-    driver, speeds, done = env.scripted_driver("scripted-careful"), [], False
-    driver.reset(0)
-    while not done:
-        _, _, terminated, truncated, info = env.step(driver())
-        speeds.append(info["speed"])
-        done = terminated or truncated
-    assert info["is_success"]
-    assert max(speeds) < 9 and np.quantile(speeds, 0.9) == pytest.approx(8, abs=0.5)
-
-
 def test_coefficients_weigh_the_reward():
     plain = SafeDriveEnv(displacement_reward=0, speed_reward=0, arrival_reward=0, out_of_road_penalty=0, collision_penalty=0)
     assert drive(plain, 2000)[1].sum() == 0

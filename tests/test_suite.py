@@ -63,7 +63,7 @@ def test_one_scale_shrinks_all_budgets_and_nothing_else():
     full, tenth = (suite_job.hyperparameters(a_job("chac", scale=scale)) for scale in (1.0, 0.1))
     assert full["n_timesteps"] == 1_000_000
     assert tenth["n_timesteps"] == 100_000
-    assert (full["switch_after"], tenth["switch_after"]) == (10_000, 1_000)
+    assert (full["switch_after"], tenth["switch_after"]) == (20_000, 2_000)
     wrapper = "sb3_chac.human.InterventionWrapper"
     assert tenth["env_wrapper"][0][wrapper]["budget"] == full["env_wrapper"][0][wrapper]["budget"] / 10
     assert tenth["learning_rate"] == full["learning_rate"]

@@ -16,7 +16,6 @@ if TYPE_CHECKING:
 
 IMPERFECTIONS = {
     "scripted": dict(reaction_delay=3, action_noise=0.1),
-    "scripted-careful": dict(reaction_delay=3, action_noise=0.1, desired_speed=8.0),
     "scripted-ideal": dict(reaction_delay=0, action_noise=0.0),
 }
 

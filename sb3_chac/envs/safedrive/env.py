@@ -348,8 +348,7 @@ class SafeDriveEnv(DrivingEnv):
         """
         Make a driver by its name.
 
-        :param name: "scripted" (with a human's imperfections), "scripted-careful" (the same at 8 instead of 10 m/s) or
-            "scripted-ideal" (without imperfections)
+        :param name: "scripted" (with a human's imperfections) or "scripted-ideal" (without)
         :return: a driver for this environment
         :raises ValueError: for another name
         """
