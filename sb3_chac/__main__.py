@@ -65,7 +65,9 @@ def import_packages(command: str, arguments: list[str]) -> list[str]:
 
 def main() -> None:
     """Run the command that the command line names."""
-    command = sys.argv[1] if len(sys.argv) > 1 else "nothing"
+    if len(sys.argv) == 1:
+        sys.exit(USAGE)
+    command = sys.argv[1]
     if command in ("-h", "--help"):
         print(USAGE)
         return
