@@ -467,13 +467,13 @@ def test_drive_with_keys_then_resume_and_replay(tmp_path, monkeypatch, capsys):
     """The whole command: a window, a takeover with keys, quit; then the drive goes on where it was."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
-    frames = play(monkeypatch, [(5, pygame.K_UP), (7, pygame.K_q)])
+    frames = play(monkeypatch, [(5, pygame.K_UP), (12, pygame.K_q)])
     command = ["drive", "--algo", "pvp", "--seed", "1", "--device", "keyboard", "--rate", "50", "--go"]
     main_with(monkeypatch, *command, "--dataset", "drives/first-v0")
     printed = capsys.readouterr().out
     assert "in 1 takeovers" in printed and "--resume logs/pvp/SafeDrive-v0_1" in printed and len(frames) > 0
 
-    play(monkeypatch, [(20, pygame.K_q)])
+    play(monkeypatch, [(25, pygame.K_q)])
     main_with(monkeypatch, "drive", "--resume", "logs/pvp/SafeDrive-v0_1")
     second = re.search(r"minari/(drives/pvp-SafeDrive-.*-v0)", capsys.readouterr().out)[1]
     model = PVP.load("logs/pvp/SafeDrive-v0_2/SafeDrive-v0.zip")
