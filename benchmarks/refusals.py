@@ -230,7 +230,7 @@ def attempt(arguments: list[str], named: tuple[str, ...], main: Callable[[], Non
             os._exit(code)
         code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
         errors.seek(0)
-        printed = errors.read()
+        printed = errors.read().replace(folder, ".").replace(str(Path.home()), "~")  # no paths of this machine in the CSV
     # argparse tells how it is used first, and there may be a progress bar
     lines = [line for line in printed.splitlines() if line.strip() and not re.search(NOISE, line)]
     clear = code == 2 and len(lines) == 1 and "Traceback" not in printed and any(word in lines[0] for word in named)
