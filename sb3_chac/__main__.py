@@ -42,25 +42,27 @@ def import_packages(command: str, arguments: list[str]) -> list[str]:
 
     parser = argparse.ArgumentParser("sb3-chac", add_help=False, allow_abbrev=False)
     parser.add_argument("--gym-packages", nargs="+", default=[])
-    parser.add_argument("--env")
-    named, _ = parser.parse_known_args(arguments)
+    named, others = parser.parse_known_args(arguments)
     if not named.gym_packages:
         return arguments
+    parser.add_argument("--env")
+    env = parser.parse_known_args(others)[0].env
     from gymnasium import registry
 
     from sb3_chac.common.naming import import_named
 
-    before, start = set(registry), arguments.index("--gym-packages")
+    before = set(registry)
     for module in named.gym_packages:
         try:
             import_named(module)
         except ImportError as error:
             parser.exit(2, f"sb3-chac: error: --gym-packages {module}: {error}. Install it, or run this in its folder.\n")
         new = set(registry) - before
-        if command != "drive":  # which makes it in this process, by its plain name
-            arguments = [f"{module}:{text}" if text == named.env and text in new else text for text in arguments]
+        if env in new and command != "drive":  # which makes it in this process, by its plain name
+            forms = {env: f"{module}:{env}", f"--env={env}": f"--env={module}:{env}"}
+            others = [forms.get(text, text) for text in others]
         before |= new
-    return arguments[:start] + arguments[start + 1 + len(named.gym_packages) :]
+    return others
 
 
 def main() -> None:

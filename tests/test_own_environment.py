@@ -112,9 +112,14 @@ def test_experts_by_name_are_evaluated(of_a_user):
         Runner(task._replace(policy=f"{of_a_user}:f"))
 
 
-def test_gym_packages_of_our_commands(of_a_user, capsys):
-    arguments = ["--env", "OfAUser-v0", "--gym-packages", of_a_user, "--expert", "scripted"]
-    assert __main__.import_packages("evaluate", arguments) == ["--env", "of_a_user:OfAUser-v0", "--expert", "scripted"]
+@pytest.mark.parametrize("joined", [False, True], ids=["apart", "joined by ="])
+def test_gym_packages_of_our_commands(of_a_user, capsys, joined):
+    def written(*option):
+        return ["=".join(option)] if joined else list(option)
+
+    arguments = [*written("--env", "OfAUser-v0"), *written("--gym-packages", of_a_user), "--expert", "scripted"]
+    expected = [*written("--env", "of_a_user:OfAUser-v0"), "--expert", "scripted"]
+    assert __main__.import_packages("evaluate", arguments) == expected
     assert "OfAUser-v0" in gym.registry
     with pytest.raises(SystemExit):
         __main__.import_packages("evaluate", ["--gym-packages", "nowhere_at_all"])

@@ -250,9 +250,9 @@ class CHAC(DPVP):
         self.confidence_update = TargetUpdate(self.confidence_critic, self.confidence_critic_target)
         self.self_update = TargetUpdate(self.self_actor, self.self_actor_target)
         self.self_average_update = TargetUpdate(self.self_actor, self.policy.averaged_self_actor)
-        # Since the logger took them, or the latest: nobody may ever take them
         # Steps of stage 2 and the highest confidence in them, until pi_r acts or a warning was given
         self.waiting: tuple[int, float] | None = (0, 0.0)
+        # Since the logger took them, or the latest: nobody may ever take them
         self.choices: deque[dict[str, np.ndarray]] = deque(maxlen=MOST_CHOICES)
         self.watch = RelapseWatch(self.relapse_window) if self.relapse_window else None
 
