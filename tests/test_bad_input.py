@@ -53,7 +53,7 @@ class OneStepDict(OneStep):
     [
         (spaces.Discrete(3), r"env: .*continuous .*Box.*Discrete\(3\).*DQN"),
         (spaces.MultiBinary(2), "env: .*continuous"),
-        (spaces.Box(-np.inf, np.inf, (1,), np.float32), "env: .*finite bounds.*RescaleAction"),
+        (spaces.Box(-np.inf, np.inf, (1,), np.float32), "env: .*finite bounds.*ClipAction"),
         (spaces.Box(np.array([0, 1.0]), np.array([1, 1.0])), "env: .*low < high"),
     ],
 )
