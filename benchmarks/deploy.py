@@ -30,8 +30,8 @@ import sb3_chac.envs  # noqa: F401
 from sb3_chac.deploy.gate import State
 from sb3_chac.deploy.link import Channel, SimulatedSocket
 from sb3_chac.deploy.policy import OnnxPolicy
-from sb3_chac.deploy.run import PolicyServer
 from sb3_chac.deploy.runtime import Runtime
+from sb3_chac.deploy.server import PolicyServer
 from sb3_chac.deploy.udp import Flag, VehicleLink
 from sb3_chac.envs.safedrive import SafeDriveEnv
 

@@ -9,8 +9,7 @@ from importlib import import_module
 
 # Name -> module
 OWN_COMMANDS = {
-    **{name: f"sb3_chac.{name}" for name in ("drive", "evaluate", "resume", "plot", "compare", "demos")},
-    **{name: f"sb3_chac.deploy.{name}" for name in ("export", "run")},
+    name: f"sb3_chac.cli.{name}" for name in ("drive", "evaluate", "resume", "plot", "compare", "demos", "export", "run")
 }
 COMMANDS = ("train", "enjoy", "plot_train", "plot_from_file", "all_plots", *OWN_COMMANDS)
 

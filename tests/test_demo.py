@@ -14,14 +14,14 @@ from stable_baselines3.common.logger import configure
 from test_zoo import ZOO
 
 from sb3_chac import CHAC, DPVP
+from sb3_chac.cli.evaluate import main as evaluate_command
+from sb3_chac.cli.plot import draw, join
+from sb3_chac.cli.plot import main as plot
 from sb3_chac.common.callbacks import CSVProgress, GuidedProgressBar
 from sb3_chac.envs.safedrive import SafeDriveEnv
-from sb3_chac.evaluate import main as evaluate_command
 from sb3_chac.evaluation.episodes import Runner, Task
 from sb3_chac.evaluation.evaluation import evaluate
 from sb3_chac.evaluation.pictures import save_video
-from sb3_chac.plot import draw, join
-from sb3_chac.plot import main as plot
 
 SWITCH_AFTER, TOTAL = 150, 300
 RUN = Path("logs") / "chac" / "SafeDrive-v0_1"

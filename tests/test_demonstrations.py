@@ -24,16 +24,16 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.vec_env import DummyVecEnv, VecTransposeImage
 from torch.utils import _pytree
 
+from sb3_chac.cli.demos import main as command
 from sb3_chac.common.demonstrations import DatasetError, Demonstrations, load_demonstrations
 from sb3_chac.datasets.recording import WatchedEnv, record
-from sb3_chac.demos import main as command
 from sb3_chac.human import InterventionWrapper, TakeoverRule
 
 TOY = "toy_env:ToyDrive-v0"
 OBSERVATIONS, ACTIONS = toy_env.ToyDrive().observation_space, toy_env.ToyDrive().action_space
 ARRAYS = ("observations", "actions", "next_observations", "rewards", "terminations", "truncations", "episodes")
 OPTIONAL = ("takeovers", "novice_actions", "costs", "successes")
-LAUNCHER = "import sys; from sb3_chac.demos import main; main(sys.argv[1:])"
+LAUNCHER = "import sys; from sb3_chac.cli.demos import main; main(sys.argv[1:])"
 
 
 @pytest.fixture(autouse=True)

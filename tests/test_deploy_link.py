@@ -23,8 +23,8 @@ from sb3_chac.deploy.link import Channel, SimulatedSocket
 from sb3_chac.deploy.log import DecisionLog, read_log
 from sb3_chac.deploy.metadata import Input, Metadata, NotDeployable
 from sb3_chac.deploy.policy import OnnxPolicy
-from sb3_chac.deploy.run import PolicyServer
 from sb3_chac.deploy.runtime import Runtime
+from sb3_chac.deploy.server import PolicyServer
 from sb3_chac.deploy.udp import (
     MAX_PACKET,
     Commanded,

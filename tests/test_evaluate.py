@@ -18,9 +18,9 @@ from stable_baselines3 import A2C, DDPG, DQN, PPO, SAC, TD3
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_chac import DSAC
+from sb3_chac.cli.demos import main as demos
+from sb3_chac.cli.evaluate import main as command
 from sb3_chac.common.demonstrations import load_demonstrations
-from sb3_chac.demos import main as demos
-from sb3_chac.evaluate import main as command
 from sb3_chac.evaluation.evaluation import evaluate, scenario_list
 from sb3_chac.evaluation.models import find_algorithm
 

@@ -24,8 +24,7 @@ LAYERS = (
     {"datasets"},
     {"deploy"},
     {"cockpit"},
-    {"evaluate", "drive", "resume", "plot", "demos"},
-    {"compare"},  # reads runs as plot does
+    {"cli"},
     {"__main__", "_startup"},
 )
 PARENTS = {"dpvp": {"dsac"}, "chac": {"dpvp"}, "hg_dagger": {"bc"}, "iwr": {"hg_dagger", "bc"}}  # an algorithm derives from it

@@ -17,6 +17,8 @@ from stable_baselines3.common.callbacks import ConvertCallback
 from stable_baselines3.common.save_util import load_from_pkl
 
 from sb3_chac import CHAC, DPVP, DSAC
+from sb3_chac.cli.plot import read_progress
+from sb3_chac.cli.resume import main as resume
 from sb3_chac.common.checkpoints import (
     ResumableCheckpoint,
     SparseWriter,
@@ -25,8 +27,6 @@ from sb3_chac.common.checkpoints import (
     newest_checkpoint,
 )
 from sb3_chac.envs.safedrive import SafeDriveEnv
-from sb3_chac.plot import read_progress
-from sb3_chac.resume import main as resume
 from sb3_chac.zoo.runs import find_training, steps
 
 SCRIPTS = Path(sysconfig.get_path("scripts"))

@@ -13,10 +13,10 @@ import pytest
 from gymnasium.envs.classic_control import PendulumEnv
 from gymnasium.envs.registration import EnvSpec
 
+from sb3_chac.cli.demos import main as demos
 from sb3_chac.cockpit.recording import ABOUT, FOLDER, Recorder, finish_recording
 from sb3_chac.common.demonstrations import open_dataset
 from sb3_chac.datasets.recording import record
-from sb3_chac.demos import main as demos
 from sb3_chac.evaluation.episodes import NotEvaluable, check_names_no_code, registered_spec
 
 ROOT = Path(__file__).parents[1]

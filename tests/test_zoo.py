@@ -11,9 +11,9 @@ import pytest
 import yaml
 from shell import run, zoo_train
 
+from sb3_chac.cli.demos import main as demos
+from sb3_chac.cli.evaluate import main as evaluate
 from sb3_chac.common.demonstrations import Demonstrations
-from sb3_chac.demos import main as demos
-from sb3_chac.evaluate import main as evaluate
 from sb3_chac.zoo import hyperparams_file
 from sb3_chac.zoo.algorithms import ALGORITHMS
 

@@ -309,39 +309,58 @@ class CHAC(DPVP):
         return self.replay_buffer.sample(batch_size, env=self._vec_normalize_env, human_share=share)
 
     def _gradient_step(self, batch: DualReplayBufferSamples) -> dict[str, th.Tensor]:
-        if self.stage == 1:
-            return super()._gradient_step(batch) | self._update_confidence_critic(batch)
+        return self._stage_1_step(batch) if self.stage == 1 else self._stage_2_step(batch)
+
+    def _stage_1_step(self, batch: DualReplayBufferSamples) -> dict[str, th.Tensor]:
+        """Make a gradient step of stage 1 of the paper's Algorithm 1: a human guides."""
+        # Z_g by proxy values and rewardless temporal differences; every policy_delay steps pi_g, alpha and all targets
+        stats = super()._gradient_step(batch)
+        # Z_c by temporal differences with reward: what pi_g is worth
+        return stats | self._update_confidence_critic(batch)
+
+    def _stage_2_step(self, batch: DualReplayBufferSamples) -> dict[str, th.Tensor]:
+        """Make a gradient step of stage 2 of the paper's Algorithm 1: shared control. pi_g and Z_g stay as they are."""
+        # Z_c by temporal differences with reward: what is executed is worth
         stats = self._update_confidence_critic(batch)
+        # Every policy_delay steps pi_r, alpha and the targets
         if self._n_updates % self.policy_delay == 0:
-            ent_coef = self._current_ent_coef()
-            with th.no_grad():
-                guided_actions = self.actor(batch.observations, deterministic=True)
-            stats |= self._update_actor(
-                self.self_actor,
-                self.confidence_critic,
-                batch.observations,
-                ent_coef,
-                lambda actions: self.anchor_coef * (actions - guided_actions).square().sum(dim=1),
-            )
+            stats |= self._update_self_actor(batch)
             if self._targets_are_due():
                 self.self_update(self.tau)
             self.self_average_update(self.average_tau)
         return stats
 
+    def _update_self_actor(self, batch: DualReplayBufferSamples) -> dict[str, th.Tensor]:
+        """pi_r maximises Q_c - alpha log pi_r - anchor_coef ||a_r - a_g||^2."""
+        with th.no_grad():
+            guided_actions = self.actor(batch.observations, deterministic=True)
+        return self._update_actor(
+            self.self_actor,
+            self.confidence_critic,
+            batch.observations,
+            self._current_ent_coef(),
+            lambda actions: self.anchor_coef * (actions - guided_actions).square().sum(dim=1),
+        )
+
     def _update_confidence_critic(self, batch: DualReplayBufferSamples) -> dict[str, th.Tensor]:
-        """Z_c evaluates, with reward, what is executed."""
-        ent_coef = self._current_ent_coef()
-        rewards, target = self._confidence_rewards(batch), self.confidence_critic_target
-        if self.stage == 1:
-            targets = self._return_targets(self.actor_target, target, batch, rewards, ent_coef)
-        elif self.bootstrap == "self" or not self.shared_control:
-            targets = self._return_targets(self.self_actor_target, target, batch, rewards, ent_coef)
-        else:
-            targets = self._shared_return_targets(batch, rewards, ent_coef)
-        losses, _, stats = self._critic_losses(self.confidence_critic, batch, targets, self.eta_c)
+        losses, _, stats = self._critic_losses(self.confidence_critic, batch, self._confidence_targets(batch), self.eta_c)
         minimize(losses.mean(dim=1).sum(), self.confidence_critic.optimizer)
         self.confidence_update(self.tau if self.tau_c is None else self.tau_c)
         return {f"confidence_{name}": value for name, value in stats.items()}
+
+    def _confidence_targets(self, batch: DualReplayBufferSamples) -> tuple[th.Tensor, th.Tensor]:
+        """
+        Compute the return targets of Z_c, with a' from who acts: pi_g in stage 1, shared control or pi_r in stage 2.
+
+        :return: y_q and y_z, both of shape (batch_size,)
+        """
+        ent_coef = self._current_ent_coef()
+        rewards, target = self._confidence_rewards(batch), self.confidence_critic_target
+        if self.stage == 1:
+            return self._return_targets(self.actor_target, target, batch, rewards, ent_coef)
+        if self.bootstrap == "self" or not self.shared_control:
+            return self._return_targets(self.self_actor_target, target, batch, rewards, ent_coef)
+        return self._shared_return_targets(batch, rewards, ent_coef)
 
     def _confidence_rewards(self, batch: DualReplayBufferSamples) -> th.Tensor:
         """

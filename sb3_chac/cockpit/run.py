@@ -90,7 +90,7 @@ class DriveRun:
     """
     One drive, in a thread of its own: environment, model and all that is written belong to it.
 
-    :param args: of the command line, see ``sb3_chac.drive``
+    :param args: of the command line, see ``sb3_chac.cli.drive``
     :param device: that the person holds
     """
 

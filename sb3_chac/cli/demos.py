@@ -2,11 +2,8 @@
 
 import argparse
 import os
-import signal
-import sys
 from collections.abc import Callable
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 import numpy as np
@@ -15,6 +12,8 @@ from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_chac.cli.arguments import check_output, parse_env_kwargs
+from sb3_chac.cli.command import run_command
 from sb3_chac.common.demonstrations import DatasetError, load_demonstrations, open_dataset
 from sb3_chac.datasets.recording import WatchedEnv, record
 from sb3_chac.datasets.replay import Replay
@@ -22,7 +21,6 @@ from sb3_chac.datasets.writer import SETTINGS
 from sb3_chac.deploy.dataset import dataset_of
 from sb3_chac.deploy.metadata import NotDeployable
 from sb3_chac.evaluation import pictures
-from sb3_chac.evaluation.arguments import check_output, parse_env_kwargs
 from sb3_chac.evaluation.episodes import NotEvaluable, make_env
 from sb3_chac.evaluation.evaluation import saved_model
 from sb3_chac.evaluation.models import DEFAULT_ENV, find_algorithm, find_normalization, load_model
@@ -94,6 +92,8 @@ def make_parser() -> argparse.ArgumentParser:
     from_log.add_argument("--env-kwargs", nargs="+", default=[], metavar="KEY:VALUE", help="passed to it, Python literals")
     replay.add_argument("--episode", type=int, default=0, metavar="K", help="number, from 0 (default: %(default)s)")
     replay.add_argument("--video", type=Path, metavar="FILE", help=".mp4 or .gif of it")
+    for command in (new, info, replay, from_log):
+        command.set_defaults(prog=command.prog)
     return parser
 
 
@@ -103,18 +103,17 @@ def main(arguments: list[str]) -> None:
 
     :param arguments: of the command line, after ``demos``
     """
-    parser = make_parser()
-    args = parser.parse_args(arguments)
+    run_command(make_parser(), arguments, run, NotEvaluable, DatasetError, NotDeployable)
+
+
+def run(args: argparse.Namespace) -> None:
+    """
+    Run one of the subcommands.
+
+    :param args: see ``make_parser``
+    """
     th.set_num_threads(1)
-    before = signal.signal(signal.SIGTERM, _stop)  # so that it cleans up as after Ctrl-C
-    try:
-        {"record": run_record, "info": run_info, "replay": run_replay, "from-log": run_from_log}[args.command](args)
-    except (NotEvaluable, DatasetError, NotDeployable, OSError) as error:
-        parser.exit(2, f"{parser.prog} {args.command}: error: {error}\n")
-    except KeyboardInterrupt:
-        parser.exit(130, f"{parser.prog} {args.command}: interrupted\n")
-    finally:
-        signal.signal(signal.SIGTERM, before)
+    {"record": run_record, "info": run_info, "replay": run_replay, "from-log": run_from_log}[args.command](args)
 
 
 def run_from_log(args: argparse.Namespace) -> None:
@@ -130,10 +129,6 @@ def run_from_log(args: argparse.Namespace) -> None:
     finally:
         env.close()
     print(f"Saved {folder}: {episodes} episodes, {steps} steps")
-
-
-def _stop(signal_number: int, frame: FrameType | None) -> None:
-    sys.exit(128 + signal_number)
 
 
 def run_record(args: argparse.Namespace) -> None:

@@ -2,9 +2,12 @@
 
 import argparse
 import sys
+from collections.abc import Callable
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 
+from sb3_chac.cli.command import run_command
 from sb3_chac.zoo import register
 from sb3_chac.zoo.runs import NotResumable, find_training, steps
 from sb3_chac.zoo.stopping import one_sentence
@@ -24,30 +27,51 @@ of its own (_2 after _1), which can be resumed in turn. If the newest checkpoint
 A run folder is code: models, replay buffers and command lines in it can run anything. Resume those that you trust only."""
 
 
+def make_parser() -> argparse.ArgumentParser:
+    """Make the parser of the command line."""
+    parser = argparse.ArgumentParser(
+        "sb3-chac resume", description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("run_folder", type=Path, metavar="RUN_FOLDER", help="e.g. logs/chac/SafeDrive-v0_1")
+    return parser
+
+
 def main(arguments: list[str]) -> None:
     """
     Run the command.
 
     :param arguments: of the command line, after ``resume``
     """
-    parser = argparse.ArgumentParser(
-        "sb3-chac resume", description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("run_folder", type=Path, metavar="RUN_FOLDER", help="e.g. logs/chac/SafeDrive-v0_1")
-    run_folder = parser.parse_args(arguments).run_folder
-    try:
-        command, model = find_training(run_folder)
-        done, total = steps(model)
-    except NotResumable as error:
-        parser.exit(2, f"{parser.prog}: error: {error}\n")
+    go_on = run_command(make_parser(), arguments, find, NotResumable)
+    if go_on is not None:
+        go_on()
+
+
+def find(args: argparse.Namespace) -> Callable[[], None] | None:
+    """
+    Find what remains to be done.
+
+    :param args: see ``make_parser``
+    :return: does it; None if nothing remains
+    :raises NotResumable: if there is nothing to go on from
+    """
+    command, model = find_training(args.run_folder)
+    done, total = steps(model)
     if done >= total:
-        print(f"{run_folder}: nothing remains to be done, all {total} steps were made.")
-        return
-
+        print(f"{args.run_folder}: nothing remains to be done, all {total} steps were made.")
+        return None
     if command[:1] == ["drive"]:
-        import_module("sb3_chac.drive").main(["--resume", str(run_folder)])
-        return
+        return partial(import_module("sb3_chac.cli.drive").main, ["--resume", str(args.run_folder)])
+    return partial(train_again, command, model)
 
+
+def train_again(command: list[str], model: Path) -> None:
+    """
+    Repeat a command line of RL-Zoo3.
+
+    :param command: of the run, after ``rl_zoo3 train``
+    :param model: that it goes on with
+    """
     with one_sentence("sb3-chac resume"):
         register()
         from rl_zoo3.train import train

@@ -4,12 +4,13 @@ import argparse
 import re
 from pathlib import Path
 
+from sb3_chac.cli.arguments import check_output
+from sb3_chac.cli.command import run_command
+from sb3_chac.cli.plot import NotPlottable, join
 from sb3_chac.evaluation import curves
-from sb3_chac.evaluation.arguments import check_output
 from sb3_chac.evaluation.curves import Method
 from sb3_chac.evaluation.episodes import NotEvaluable
 from sb3_chac.evaluation.pictures import PLOT_SUFFIXES
-from sb3_chac.plot import NotPlottable, join
 
 DESCRIPTION = """Compare runs of 'rl_zoo3 train': learning curves (mean over seeds, shaded its 95 % bootstrap interval) in one
 figure; interquartile means and the probability of improvement, with 95 % bootstrap intervals (rliable), in one table. The
@@ -56,18 +57,24 @@ def main(arguments: list[str]) -> None:
 
     :param arguments: of the command line, after ``compare``
     """
-    parser = make_parser()
-    args = parser.parse_args(arguments)
-    try:
-        for option, files, suffixes in (("--out", args.out, PLOT_SUFFIXES), ("--table", args.table, TABLE_SUFFIXES)):
-            for file in files:
-                check_output(option, file, suffixes)
-        methods = read(args.runs)
-        if args.x == "human":
-            methods = with_human(methods)
-        write(methods, args)
-    except (NotEvaluable, OSError) as error:  # such as a full disk
-        parser.exit(2, f"{parser.prog}: error: {error}\n")
+    run_command(make_parser(), arguments, run, NotEvaluable)
+
+
+def run(args: argparse.Namespace) -> None:
+    """
+    Compare runs.
+
+    :param args: see ``make_parser``
+    :raises FileNotFoundError: if a run, or the folder of an output file, does not exist
+    :raises NotEvaluable: for whatever else does not fit
+    """
+    for option, files, suffixes in (("--out", args.out, PLOT_SUFFIXES), ("--table", args.table, TABLE_SUFFIXES)):
+        for file in files:
+            check_output(option, file, suffixes)
+    methods = read(args.runs)
+    if args.x == "human":
+        methods = with_human(methods)
+    write(methods, args)
 
 
 def read(runs: list[str]) -> list[Method]:

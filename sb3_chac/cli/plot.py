@@ -11,8 +11,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from sb3_chac.cli.arguments import check_output
+from sb3_chac.cli.command import run_command
 from sb3_chac.common.callbacks import PROGRESS_FILE
-from sb3_chac.evaluation.arguments import check_output
 from sb3_chac.evaluation.episodes import NotEvaluable
 from sb3_chac.evaluation.pictures import PLOT_SUFFIXES
 
@@ -56,12 +57,8 @@ PANELS = {
 Curves = dict[str, np.ndarray]
 
 
-def main(arguments: list[str]) -> None:
-    """
-    Run the command.
-
-    :param arguments: of the command line, after ``plot``
-    """
+def make_parser() -> argparse.ArgumentParser:
+    """Make the parser of the command line."""
     parser = argparse.ArgumentParser(
         "sb3-chac plot", description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -69,20 +66,36 @@ def main(arguments: list[str]) -> None:
         "run_folders", nargs="+", type=Path, metavar="RUN_FOLDER", help="a run, and in order those that resumed it"
     )
     parser.add_argument("--out", type=Path, metavar="FILE", help=".png, .svg or .pdf (default: curves.png in the last folder)")
-    args = parser.parse_args(arguments)
+    return parser
+
+
+def main(arguments: list[str]) -> None:
+    """
+    Run the command.
+
+    :param arguments: of the command line, after ``plot``
+    """
+    run_command(make_parser(), arguments, run, NotEvaluable)
+
+
+def run(args: argparse.Namespace) -> None:
+    """
+    Plot a run.
+
+    :param args: see ``make_parser``
+    :raises FileNotFoundError: if a run, or the folder of the picture, does not exist
+    :raises NotEvaluable: for whatever else does not fit
+    """
     out = args.out or args.run_folders[-1] / "curves.png"
-    try:
-        curves = join(args.run_folders)
-        check_output("--out", out, PLOT_SUFFIXES)
-    except (NotEvaluable, FileNotFoundError) as error:
-        parser.exit(2, f"{parser.prog}: error: {error}\n")
+    curves = join(args.run_folders)
+    check_output("--out", out, PLOT_SUFFIXES)
     figure = draw(curves)
     figure.suptitle(", ".join(map(str, args.run_folders)), fontsize="medium")
     try:
         figure.savefig(out, dpi=150)
     except OSError as error:  # such as a full disk
         out.unlink(missing_ok=True)
-        parser.exit(2, f"{parser.prog}: error: --out {out}: cannot be written ({error.strerror or error}).\n")
+        raise NotEvaluable(f"--out {out}: cannot be written ({error.strerror or error}).") from error
     print(f"Saved {out}")
 
 

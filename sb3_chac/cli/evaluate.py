@@ -4,13 +4,16 @@ import argparse
 import csv
 import os
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_chac.chac.policies import CONTROLS
+from sb3_chac.cli.arguments import check_output, parse_env_kwargs
+from sb3_chac.cli.command import run_command
 from sb3_chac.evaluation import pictures
-from sb3_chac.evaluation.arguments import check_output, parse_env_kwargs
 from sb3_chac.evaluation.episodes import NotEvaluable, Runner, Task, make_env
 from sb3_chac.evaluation.evaluation import Evaluation, compare, evaluate, scenario_list
 from sb3_chac.evaluation.models import DEFAULT_ENV, env_of, find_algorithm, find_normalization, load_model
@@ -83,18 +86,29 @@ def main(arguments: list[str]) -> None:
 
     :param arguments: of the command line, after ``evaluate``
     """
-    parser = make_parser()
-    args = parser.parse_args(arguments)
-    if (args.model is None) == (args.expert is None):
-        parser.exit(2, f"{parser.prog}: error: give either a MODEL.zip or --expert NAME\n")
-    if args.model is None and args.policy is not None:
-        parser.exit(2, f"{parser.prog}: error: --policy {args.policy} needs a C-HAC model\n")
+    run_command(make_parser(), arguments, run, NotEvaluable)
 
-    th.set_num_threads(1)
-    try:
-        run(args)
-    except (NotEvaluable, OSError) as error:  # such as a full disk
-        parser.exit(2, f"{parser.prog}: error: {error}\n")
+
+class Request(NamedTuple):
+    """
+    What a command line asks for, checked.
+
+    :param policy: model, or name of an expert
+    :param env: id of the environment
+    :param env_kwargs: passed to it
+    :param normalize: statistics that a model's observations are normalized with, None if they are not
+    :param others: name -> whom it is compared with on the same episodes
+    :param who: entries of the settings that say who acts
+    :param filmed: scenario (or episode) of the video
+    """
+
+    policy: BaseAlgorithm | str
+    env: str
+    env_kwargs: dict[str, Any]
+    normalize: VecNormalize | None
+    others: dict[str, BaseAlgorithm | str]
+    who: dict[str, str]
+    filmed: int
 
 
 def run(args: argparse.Namespace) -> None:
@@ -105,7 +119,25 @@ def run(args: argparse.Namespace) -> None:
     :raises FileNotFoundError: if the model, or the folder of an output file, does not exist
     :raises NotEvaluable: for whatever else does not fit, found before the episodes run
     """
-    args.env = env_of(args.model) if args.env is None else args.env
+    th.set_num_threads(1)
+    request = resolve(args)
+    check_task(args, request)
+    evaluation, beside = assess(args, request)
+    print(compare([evaluation, *beside]) if beside else evaluation.table())
+    write_files(args, evaluation, request)
+
+
+def resolve(args: argparse.Namespace) -> Request:
+    """
+    Find what the command line names.
+
+    :raises FileNotFoundError: if the model, or the folder of an output file, does not exist
+    :raises NotEvaluable: for whatever does not fit
+    """
+    if (args.model is None) == (args.expert is None):
+        raise NotEvaluable("give either a MODEL.zip or --expert NAME")
+    if args.model is None and args.policy is not None:
+        raise NotEvaluable(f"--policy {args.policy} needs a C-HAC model")
     check_output("--json", args.json)
     check_output("--steps", args.steps, (".csv",))
     check_output("--plot", args.plot, pictures.PLOT_SUFFIXES)
@@ -119,73 +151,93 @@ def run(args: argparse.Namespace) -> None:
     if filmed not in numbers:
         raise NotEvaluable(f"--video-scenario {filmed} is not among those that are evaluated.")
 
+    env_id = env_of(args.model) if args.env is None else args.env
     env_kwargs = parse_env_kwargs(args.env_kwargs)
-    policy, normalize, who = args.expert, None, {"expert": args.expert}
     others: dict[str, BaseAlgorithm | str] = {name: name for name in args.beside}
-    if args.model is not None:
-        path, algo, algorithm = find_algorithm(args.model, args.algo)
-        env = make_env(args.env, env_kwargs)
-        policy = load_model(path, algo, algorithm, env, args.policy)
-        others |= {name: load_model(path, algo, algorithm, env, name) for name in args.beside if name in CONTROLS}
-        statistics, normalize = find_normalization(path, args.env, env)
-        env.close()
-        print(f"{path}: {algorithm.__name__}" + (f", observations normalized with {statistics}" if normalize else ""))
-        who = {"model": str(path), "algo": algo}
+    if args.model is None:
+        return Request(args.expert, env_id, env_kwargs, None, others, {"expert": args.expert}, filmed)
 
-    task = Task(policy, args.env, env_kwargs, normalize, args.seed, args.episodes is None)
+    path, algo, algorithm = find_algorithm(args.model, args.algo)
+    env = make_env(env_id, env_kwargs)
+    policy = load_model(path, algo, algorithm, env, args.policy)
+    others |= {name: load_model(path, algo, algorithm, env, name) for name in args.beside if name in CONTROLS}
+    statistics, normalize = find_normalization(path, env_id, env)
+    env.close()
+    print(f"{path}: {algorithm.__name__}" + (f", observations normalized with {statistics}" if normalize else ""))
+    return Request(policy, env_id, env_kwargs, normalize, others, {"model": str(path), "algo": algo}, filmed)
+
+
+def task_of(args: argparse.Namespace, request: Request) -> Task:
+    """Return the episodes of the model or expert."""
+    return Task(request.policy, request.env, request.env_kwargs, request.normalize, args.seed, args.episodes is None)
+
+
+def check_task(args: argparse.Namespace, request: Request) -> None:
+    """
+    Check before the episodes run that they can be driven, and drawn as the command line says.
+
+    :raises NotEvaluable: if not
+    """
+    task, first = task_of(args, request), scenario_list(args.scenarios)[0] if args.episodes is None else 0
     if args.plot or args.steps or args.video:
         with Runner(task) as runner:
             if args.steps:
-                pictures.check_has(runner, numbers[0], "position")
+                pictures.check_has(runner, first, "position")
             if args.plot:
-                pictures.check_has(runner, numbers[0], "position", "plot_map")
+                pictures.check_has(runner, first, "position", "plot_map")
             if args.video:
                 pictures.check_can_render(runner)
-    for other in others.values():
+    for other in request.others.values():
         Runner(task._replace(policy=other)).env.close()  # finds what does not fit
 
-    def assess(acting: BaseAlgorithm | str, record_paths: bool = False) -> Evaluation:
+
+def assess(args: argparse.Namespace, request: Request) -> tuple[Evaluation, list[Evaluation]]:
+    """
+    Run the episodes.
+
+    :return: evaluation of the model or expert, and of each that it is compared with
+    """
+
+    def assess_one(acting: BaseAlgorithm | str, record_paths: bool = False) -> Evaluation:
         return evaluate(
             acting,
-            args.env,
+            request.env,
             args.scenarios,
             episodes=args.episodes,
             seed=args.seed,
             jobs=args.jobs,
-            env_kwargs=env_kwargs,
-            normalize=None if isinstance(acting, str) else normalize,
+            env_kwargs=request.env_kwargs,
+            normalize=None if isinstance(acting, str) else request.normalize,
             record_paths=record_paths,
             progress_bar=True,
         )
 
-    evaluation = assess(policy, record_paths=bool(args.plot or args.steps))
-    evaluation.settings |= who
-    beside = {name: assess(other) for name, other in others.items()}
+    evaluation = assess_one(request.policy, record_paths=bool(args.plot or args.steps))
+    evaluation.settings |= request.who
+    beside = {name: assess_one(other) for name, other in request.others.items()}
     if beside:
         evaluation.settings["beside"] = {name: other.to_dict() for name, other in beside.items()}
-    print(compare([evaluation, *beside.values()]) if beside else evaluation.table())
-    write_files(args, evaluation, task, filmed)
+    return evaluation, list(beside.values())
 
 
-def write_files(args: argparse.Namespace, evaluation: Evaluation, task: Task, filmed: int) -> None:
+def write_files(args: argparse.Namespace, evaluation: Evaluation, request: Request) -> None:
     """
     Write the files of an evaluation.
 
     :param args: which files
     :param evaluation: what goes into them
-    :param task: what was evaluated
-    :param filmed: scenario (or episode) of the video
+    :param request: that was evaluated
     """
     if args.json:
         args.json.write_text(evaluation.to_json() + "\n")
     if args.steps:
         write_steps(args.steps, evaluation)
     if args.plot:
-        with Runner(task) as runner:
+        with Runner(task_of(args, request)) as runner:
             pictures.save_plot(args.plot, runner, evaluation)
     if args.video:
-        with Runner(task, render_mode="rgb_array") as runner:
-            pictures.save_video(args.video, runner, filmed)
+        with Runner(task_of(args, request), render_mode="rgb_array") as runner:
+            pictures.save_video(args.video, runner, request.filmed)
     for file in filter(None, (args.json, args.steps, args.plot, args.video)):
         print(f"Saved {file}")
 

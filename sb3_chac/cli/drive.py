@@ -2,7 +2,7 @@
 
 import argparse
 import asyncio
-import os
+import functools
 import re
 import shlex
 import sys
@@ -12,6 +12,8 @@ from typing import Any
 
 import torch as th
 
+from sb3_chac.cli.arguments import parse_env_kwargs
+from sb3_chac.cli.command import run_command
 from sb3_chac.cockpit.devices import (
     GAMEPAD,
     WHEEL,
@@ -25,9 +27,6 @@ from sb3_chac.cockpit.devices import (
     save_config,
 )
 from sb3_chac.cockpit.person import NotDrivable
-from sb3_chac.common.demonstrations import DatasetError
-from sb3_chac.evaluation.arguments import parse_env_kwargs
-from sb3_chac.evaluation.episodes import NotEvaluable
 from sb3_chac.evaluation.models import DEFAULT_ENV
 
 DESCRIPTION = """Train with yourself as the human: watch the novice drive, take over at any moment, hand back.
@@ -101,20 +100,23 @@ def main(arguments: list[str]) -> None:
 
     :param arguments: of the command line, after ``drive``
     """
-    parser = make_parser()
-    args = parser.parse_args(arguments)
+    run_command(make_parser(), arguments, functools.partial(run, arguments), ValueError, RuntimeError)
+
+
+def run(arguments: list[str], args: argparse.Namespace) -> None:
+    """
+    Calibrate, recover, resume or begin.
+
+    :param arguments: of the command line
+    :param args: see ``make_parser``
+    """
     th.set_num_threads(1)
-    try:
-        if args.calibrate:
-            calibrate(args.calibrate)
-        elif args.recover:
-            recover(args.recover)
-        else:
-            run(args, arguments)
-    except (NotDrivable, NotEvaluable, DeviceError, DatasetError, OSError, ValueError, RuntimeError) as error:
-        if os.environ.get("SB3_CHAC_TRACEBACK"):
-            raise
-        parser.exit(2, f"{parser.prog}: error: {error}\n")
+    if args.calibrate:
+        calibrate(args.calibrate)
+    elif args.recover:
+        recover(args.recover)
+    else:
+        begin_or_resume(args, arguments)
 
 
 def recover(run_folder: Path) -> None:
@@ -132,7 +134,7 @@ def recover(run_folder: Path) -> None:
     print(summary)
 
 
-def run(args: argparse.Namespace, arguments: list[str]) -> None:
+def begin_or_resume(args: argparse.Namespace, arguments: list[str]) -> None:
     """
     Begin or resume a drive.
 

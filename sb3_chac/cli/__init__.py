@@ -1,0 +1,1 @@
+"""Commands of ``sb3-chac``, one module each."""
