@@ -80,7 +80,9 @@ def run(args: argparse.Namespace) -> None:
                 action, _ = model.predict(observation, deterministic=True)
                 choice = model.policy.last_choice
                 if choice is not None and rng.random() < 1 / args.every:
-                    guided, own = (model.predict(observation, deterministic=True, policy=who)[0] for who in ("guided", "self"))
+                    guided, own = (
+                        model.predict(observation, deterministic=True, control=who)[0] for who in ("guided", "self")
+                    )
                     returns = [discounted_return(copy_of(env), model, a, args.steps) for a in (own, guided)]
                     confidence = float(choice.confidence)
                     numbers = [f"{value:.5f}" for value in (confidence, *returns)]

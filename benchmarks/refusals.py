@@ -72,7 +72,7 @@ OWN: dict[str, dict[str, tuple[str, ...]]] = {
         "--plot": (*NOT_FILES, "paths.txt"),
         "--video": (*NOT_FILES, "drive.txt"),
         "--video-scenario": ("7", "-1", "many"),
-        "--policy": ("self", "nonsense"),
+        "--control": ("self", "nonsense"),
         "--expert": ("nobody", "", "os:system"),
         "--nonsense": ("1",),
     },

@@ -59,7 +59,7 @@ def set_critic(model, q_value, std=lambda actions: 1.0):
 
 
 def predict(model, who, obs=OBS, deterministic=True):
-    return model.predict(obs, deterministic=deterministic, policy=who)[0]
+    return model.predict(obs, deterministic=deterministic, control=who)[0]
 
 
 # --- Confidence and choice
@@ -210,7 +210,7 @@ def test_in_stage_1_pi_g_acts():
 @pytest.mark.parametrize("who", ["human", "", 3])
 def test_unknown_policies_are_refused(who):
     model = in_stage_2()
-    with pytest.raises(ValueError, match=r"^policy must be one of 'guided', 'self', 'shared'"):
+    with pytest.raises(ValueError, match=r"^control must be one of 'guided', 'self', 'shared'"):
         predict(model, who)
     assert model.policy.control == "shared"
 

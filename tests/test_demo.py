@@ -176,7 +176,7 @@ def test_errors_of_plot(tmp_path, monkeypatch, capsys, arguments, message):
 
 def test_policies_beside_each_other(toy, tmp_path, capsys):
     options = ["--env", "toy_env:ToyDrive-v0", "--scenarios", "0:3", "--json", str(tmp_path / "result.json")]
-    evaluate_command([str(toy), *options, "--policy", "self", "--beside", "guided", "lazy", "--jobs", "1"])
+    evaluate_command([str(toy), *options, "--control", "self", "--beside", "guided", "lazy", "--jobs", "1"])
     lines = capsys.readouterr().out.splitlines()
     start = lines.index("toy_env:ToyDrive-v0, 3 episodes each, mean ± std")
     assert lines[start + 1].split("  ")[0] == "policy" and lines[start + 1].endswith("steps")
@@ -229,13 +229,13 @@ def test_the_chosen_policy_acts_in_every_process(toy):
 @pytest.mark.parametrize(
     "arguments, message",
     [
-        (["sac.zip", "--policy", "self"], "'self' is a policy of C-HAC models, sac.zip is a model of sac"),
+        (["sac.zip", "--control", "self"], "'self' is a policy of C-HAC models, sac.zip is a model of sac"),
         (["sac.zip", "--beside", "guided"], "'guided' is a policy of C-HAC models"),
-        (["stage_1.zip", "--policy", "shared"], "is in stage 1, where the guided policy acts alone"),
+        (["stage_1.zip", "--control", "shared"], "is in stage 1, where the guided policy acts alone"),
         (["stage_1.zip", "--beside", "guided", "self"], "there is no 'self' yet"),
         (["stage_1.zip", "--beside", "mad"], "expert 'mad' is not available"),
-        (["stage_1.zip", "--policy", "mine"], "invalid choice: 'mine'"),
-        (["--expert", "lazy", "--policy", "self"], "--policy self needs a C-HAC model"),
+        (["stage_1.zip", "--control", "mine"], "invalid choice: 'mine'"),
+        (["--expert", "lazy", "--control", "self"], "--control self needs a C-HAC model"),
         (["--expert", "lazy", "--beside", "guided"], "expert 'guided' is not available"),
     ],
 )

@@ -100,7 +100,7 @@ def test_shared_control_tells_who_drives(tmp_path):
         assert proposal.self_drives == bool(choice.self_drives)
         assert proposal.confidence == pytest.approx(float(choice.confidence), abs=1e-5)
         assert np.allclose(
-            proposal.guided_action, model.predict(observation, deterministic=True, policy="guided")[0], atol=1e-5
+            proposal.guided_action, model.predict(observation, deterministic=True, control="guided")[0], atol=1e-5
         )
         drivers.add(proposal.self_drives)
     assert drivers == {True, False}
@@ -199,7 +199,7 @@ def test_command_line(tmp_path, capsys, monkeypatch):
     metadata = OnnxPolicy("policy.onnx").metadata
     assert metadata.model_sha256 == hashlib.sha256((tmp_path / "sac-Pendulum-v1.zip").read_bytes()).hexdigest()
     assert metadata.environment == "Pendulum-v1" and metadata.rate == 30
-    for wrong, named in [(["--check", "0"], "--check"), (["--rate", "nan"], "--rate"), (["--policy", "self"], "C-HAC")]:
+    for wrong, named in [(["--check", "0"], "--check"), (["--rate", "nan"], "--rate"), (["--control", "self"], "C-HAC")]:
         monkeypatch.setattr("sys.argv", [*sb3, *wrong])
         with pytest.raises(SystemExit, match="2"):
             sb3_chac()

@@ -261,7 +261,7 @@ def test_malformed_scenarios(text):
         (["model.zip", "--env", "Pendulum-v1", "--episodes", "1"], "Observation spaces do not match"),
         (["model.zip", "--env", "toy_env:BlindDrive-v0"], "cannot be loaded as sac"),
         (["--expert", "mad"], "expert 'mad' is not available"),
-        (["--expert", "scripted", "--env", "Pendulum-v1", "--episodes", "1"], "has no scripted drivers"),
+        (["--expert", "scripted", "--env", "Pendulum-v1", "--episodes", "1"], "has no scripted driver"),
         (["--expert", "scripted", "--env", "NoSuch-v0"], "`NoSuch` doesn't exist"),
         (["--expert", "scripted", "--env", "nowhere:NoSuch-v0"], "No module named 'nowhere'"),
         (["--expert", "scripted", "--env-kwargs", "wings:2"], "cannot be made with env_kwargs {'wings': 2}"),

@@ -132,6 +132,6 @@ def test_the_stage_travels():
     """A policy that was exported in stage 1 and one in stage 2 differ, and the shared one is neither of the two alone."""
     model, shared = trained("CHAC", STAGES["CHAC 2"])
     assert isinstance(model, sb3_chac.CHAC)
-    acts = [model.predict(OBSERVATIONS, deterministic=True, policy=policy)[0] for policy in ("guided", "self")]
+    acts = [model.predict(OBSERVATIONS, deterministic=True, control=control)[0] for control in ("guided", "self")]
     assert not np.allclose(acts[0], acts[1])
     assert np.logical_or(*(np.isclose(act, shared).all(axis=1) for act in acts)).all()

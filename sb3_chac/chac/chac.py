@@ -504,18 +504,21 @@ class CHAC(DPVP):
         state: tuple[np.ndarray, ...] | None = None,
         episode_start: np.ndarray | None = None,
         deterministic: bool = False,
+        control: str | None = None,
         policy: str | None = None,
     ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
         """
         Predict actions, as in SB3, under shared control.
 
-        :param policy: who acts in stage 2: "guided" (pi_g), "self" (pi_r) or "shared"; by default as in training
-        :raises ValueError: for another ``policy``
+        :param control: who acts in stage 2: "guided" (pi_g), "self" (pi_r) or "shared"; by default as in training
+        :param policy: old name of ``control``
+        :raises ValueError: for another ``control``
         """
-        if policy not in (None, *CONTROLS):
-            raise ValueError(f"policy must be one of {', '.join(map(repr, CONTROLS))}, got {policy!r}.")
+        control = control if policy is None else policy
+        if control not in (None, *CONTROLS):
+            raise ValueError(f"control must be one of {', '.join(map(repr, CONTROLS))}, got {control!r}.")
         usual = self.policy.control
-        self.policy.control = policy or usual
+        self.policy.control = control or usual
         try:
             return super().predict(observation, state, episode_start, deterministic)
         finally:

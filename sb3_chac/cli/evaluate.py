@@ -42,7 +42,9 @@ def make_parser() -> argparse.ArgumentParser:
     who.add_argument("model", nargs="?", type=Path, metavar="MODEL.zip", help="a model saved by Stable-Baselines3")
     who.add_argument("--expert", metavar="NAME", help="an expert of the environment, as scripted, or package.module:function")
     who.add_argument("--algo", metavar="NAME", help="algorithm of the model as RL-Zoo3 calls it (default: read from the file)")
-    who.add_argument("--policy", choices=CONTROLS, help="who acts of a C-HAC model in stage 2 (default: as in its training)")
+    who.add_argument(
+        "--control", "--policy", choices=CONTROLS, help="who acts of a C-HAC model in stage 2 (default: as in its training)"
+    )
     who.add_argument(
         "--beside",
         nargs="+",
@@ -136,8 +138,8 @@ def resolve(args: argparse.Namespace) -> Request:
     """
     if (args.model is None) == (args.expert is None):
         raise NotEvaluable("give either a MODEL.zip or --expert NAME")
-    if args.model is None and args.policy is not None:
-        raise NotEvaluable(f"--policy {args.policy} needs a C-HAC model")
+    if args.model is None and args.control is not None:
+        raise NotEvaluable(f"--control {args.control} needs a C-HAC model")
     check_output("--json", args.json)
     check_output("--steps", args.steps, (".csv",))
     check_output("--plot", args.plot, pictures.PLOT_SUFFIXES)
@@ -159,7 +161,7 @@ def resolve(args: argparse.Namespace) -> Request:
 
     path, algo, algorithm = find_algorithm(args.model, args.algo)
     env = make_env(env_id, env_kwargs)
-    policy = load_model(path, algo, algorithm, env, args.policy)
+    policy = load_model(path, algo, algorithm, env, args.control)
     others |= {name: load_model(path, algo, algorithm, env, name) for name in args.beside if name in CONTROLS}
     statistics, normalize = find_normalization(path, env_id, env)
     env.close()

@@ -43,7 +43,7 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument("--env-kwargs", nargs="+", default=[], metavar="KEY:VALUE", help="passed to it, Python literals")
     parser.add_argument("--algo", metavar="NAME", help="algorithm as RL-Zoo3 calls it (default: read from the file)")
     parser.add_argument(
-        "--policy", choices=CONTROLS, help="who acts of a C-HAC model in stage 2 (default: as in its training)"
+        "--control", "--policy", choices=CONTROLS, help="who acts of a C-HAC model in stage 2 (default: as in its training)"
     )
     parser.add_argument("--rate", type=float, metavar="HZ", help="decisions per second (default: the environment's)")
     parser.add_argument("--check", type=int, metavar="N", help="drive N steps and compare with predict(); differences fail")
@@ -83,7 +83,7 @@ def run(args: argparse.Namespace) -> bool:
     env_id = args.env or env_of(path)
     env = make_env(env_id, parse_env_kwargs(args.env_kwargs))
     try:
-        model = load_model(path, algo, algorithm, env, args.policy)
+        model = load_model(path, algo, algorithm, env, args.control)
         ModelDriver(model, env, None)  # finds what does not fit
         statistics, normalize = find_normalization(path, env_id, env)
         digest = hashlib.sha256(path.read_bytes()).hexdigest()

@@ -16,9 +16,8 @@ from stable_baselines3.common.utils import FloatSchedule, check_for_correct_spac
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 import sb3_chac.envs  # noqa: F401  (registers our environments)
-from sb3_chac.common.naming import is_name
 from sb3_chac.envs.driving.corridors import corridors_remedy
-from sb3_chac.human.experts import make_expert
+from sb3_chac.human.experts import ModelExpert, make_expert
 
 # Stored with a model, but of no use for acting (a schedule may not even load in another Python version)
 NOT_FOR_ACTING = {
@@ -141,39 +140,26 @@ class SavedModel(NamedTuple):
         return model
 
 
-class ModelDriver:
+class ModelDriver(ModelExpert):
     """
-    A model in the form of a driver: ``reset(seed)``, then one call per step.
+    A model that fits an environment, with what a display shows of it.
 
     :raises NotEvaluable: unless the spaces of the model and of the environment agree
     """
 
     def __init__(self, model: BaseAlgorithm, env: gym.Env, normalize: VecNormalize | None) -> None:
-        self.model = model
-        self.normalize = normalize
         try:
             wrapped = model._wrap_env(DummyVecEnv([lambda: env]), verbose=0, monitor_wrapper=False)  # transposes images
             check_for_correct_spaces(wrapped, model.observation_space, model.action_space)
         except ValueError as error:
             remedy = corridors_remedy(model.observation_space, env.observation_space)
             raise NotEvaluable(f"the model does not fit {env.unwrapped}: {error}.{remedy}") from None
-        self.reset()
-
-    def reset(self, seed: int = 0) -> None:
-        self.state: tuple[np.ndarray, ...] | None = None
-        self.episode_start = np.ones(1, dtype=bool)
-
-    def __call__(self, observation: Any) -> Any:
-        if self.normalize is not None:
-            observation = self.normalize.normalize_obs(observation)
-        action, self.state = self.model.predict(observation, self.state, self.episode_start, deterministic=True)
-        self.episode_start = np.zeros(1, dtype=bool)
-        return action[()]  # a discrete action as a number
+        super().__init__(model, normalize)
 
     @property
     def hud(self) -> dict[str, Any]:
         """Stage, source of the last action and confidence, for a ``TakeoverDisplay``; empty without shared control."""
-        policy: Any = self.model.policy
+        policy: Any = self.model.policy  # type: ignore[attr-defined]
         control = getattr(policy, "control", None)
         if control is None:
             return {}
@@ -234,15 +220,8 @@ class Runner:
             return ModelDriver(policy, self.env, self.task.normalize)
         if not isinstance(policy, str):
             return policy
-        if is_name(policy):
-            try:
-                return make_expert(policy, self.env)
-            except ValueError as error:
-                raise NotEvaluable(str(error)) from error
-        if not hasattr(self.env.unwrapped, "scripted_driver"):
-            raise NotEvaluable(f"expert {policy!r}: {self.env.unwrapped} has no scripted drivers.")
         try:
-            return self.env.unwrapped.scripted_driver(policy)
+            return make_expert(policy, self.env)
         except (ValueError, KeyError) as error:
             raise NotEvaluable(f"expert {policy!r} is not available in {self.env.unwrapped}: {error}") from error
 

@@ -12,7 +12,7 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.type_aliases import PolicyPredictor
-from stable_baselines3.common.vec_env import VecTransposeImage
+from stable_baselines3.common.vec_env import VecNormalize, VecTransposeImage
 
 from sb3_chac.common.naming import is_name, named_object
 
@@ -59,14 +59,13 @@ class ModelExpert:
     """
     A model of SB3, sb3-contrib or this package, asked for its deterministic action; recurrent ones keep their state.
 
-    A model that was trained with VecNormalize expects normalised observations: pass
-    ``lambda obs: model.predict(vec_normalize.normalize_obs(obs), deterministic=True)[0]`` instead.
-
     :param model: anything with SB3's ``predict``
+    :param normalize: statistics that observations are normalized with, for a model that was trained with VecNormalize
     """
 
-    def __init__(self, model: PolicyPredictor):
+    def __init__(self, model: PolicyPredictor, normalize: VecNormalize | None = None):
         self.model = model
+        self.normalize = normalize
         self.reset()
 
     def reset(self, seed: int | None = None) -> None:
@@ -74,11 +73,13 @@ class ModelExpert:
         self.episode_start = np.ones(1, dtype=bool)
 
     def __call__(self, observation: Any) -> np.ndarray:
+        if self.normalize is not None:
+            observation = self.normalize.normalize_obs(observation)
         action, self.state = self.model.predict(
             observation, state=self.state, episode_start=self.episode_start, deterministic=True
         )
         self.episode_start = np.zeros(1, dtype=bool)
-        return action
+        return action[()]  # a discrete action as a number
 
 
 def within(seconds: float | None, function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
