@@ -1,0 +1,5 @@
+"""Former place of ``sb3_chac.common.demonstrations``, for programs that import from it."""
+
+from sb3_chac.common.demonstrations import DatasetError, Demonstrations, load_demonstrations, open_dataset
+
+__all__ = ["DatasetError", "Demonstrations", "load_demonstrations", "open_dataset"]
