@@ -38,10 +38,10 @@ import pygame
 import torch as th
 
 from sb3_chac import drive as command
-from sb3_chac.cockpit.browser import Address, Browser
 from sb3_chac.cockpit.devices import Device, Keyboard
-from sb3_chac.cockpit.emulator import DeviceEmulator
-from sb3_chac.cockpit.run import DriveRun
+from sb3_chac.cockpit.devices.browser import Address, Browser
+from sb3_chac.cockpit.devices.emulator import DeviceEmulator
+from sb3_chac.cockpit.experiment import CockpitRun
 from sb3_chac.cockpit.window import Window
 
 RESULTS = Path(__file__).parent / "results" / "cockpit"
@@ -78,7 +78,7 @@ class Person(threading.Thread):
                     break
 
 
-def make_run(env: str, folder: str, device: Device, *arguments: str) -> DriveRun:
+def make_run(env: str, folder: str, device: Device, *arguments: str) -> CockpitRun:
     """
     :param env: id
     :param folder: for everything that is written
@@ -91,7 +91,7 @@ def make_run(env: str, folder: str, device: Device, *arguments: str) -> DriveRun
     command.check_arguments(args)
     sys.argv[1:] = ["drive", *own]
     th.set_num_threads(1)
-    return DriveRun(args, device)
+    return CockpitRun(args, device)
 
 
 def measure(env: str, minutes: float) -> None:
@@ -110,7 +110,7 @@ def measure(env: str, minutes: float) -> None:
             while run.cockpit is None and not run.is_over:
                 time.sleep(0.01)
             assert run.cockpit is not None
-            vehicle = run.cockpit.env
+            vehicle = run.cockpit.wrapper
             step = vehicle.step
 
             def timed(action: np.ndarray) -> Any:
@@ -300,7 +300,7 @@ def pictures() -> None:
                 "SafeDrive-v0", folder, Keyboard(), "--algo", algo, "--trained-agent", str(agent), *OLD.get(algo, ())
             )
 
-            def is_over(run: DriveRun = run, window: Window = window, keys: list[int] = keys, name: str = name) -> bool:
+            def is_over(run: CockpitRun = run, window: Window = window, keys: list[int] = keys, name: str = name) -> bool:
                 display = run.drive.display
                 while keys and display.number >= 60:
                     DeviceEmulator().press(keys.pop())

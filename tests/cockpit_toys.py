@@ -4,10 +4,10 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from sb3_chac.cockpit.env import Cockpit
 from sb3_chac.cockpit.person import Person
-from sb3_chac.cockpit.recording import Recorder
-from sb3_chac.cockpit.session import Drive
+from sb3_chac.cockpit.recording import CrashSafeRecorder
+from sb3_chac.cockpit.session import Session
+from sb3_chac.cockpit.wrapper import Cockpit
 from sb3_chac.human import InterventionWrapper
 
 
@@ -41,9 +41,9 @@ class Car(gym.Env):
 
 
 def cockpit(tmp_path, device, car=None, rate=1000.0):
-    drive = Drive(Person(device), rate)
+    drive = Session(Person(device), rate)
     car = car or Car()
     watched = InterventionWrapper(car, drive.person, drive.person.drives)
-    env = Cockpit(watched, drive, Recorder(tmp_path, car, str(tmp_path / "drive-v0"), "test", 0.1))
+    env = Cockpit(watched, drive, CrashSafeRecorder(tmp_path, car, str(tmp_path / "drive-v0"), "test", 0.1))
     drive.go_on()
     return env, drive, car

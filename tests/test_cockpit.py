@@ -30,11 +30,11 @@ from sb3_chac.cockpit.devices import (
     load_config,
     save_config,
 )
-from sb3_chac.cockpit.emulator import DeviceEmulator
+from sb3_chac.cockpit.devices.emulator import DeviceEmulator
 from sb3_chac.cockpit.learner import driven
 from sb3_chac.cockpit.person import NotDrivable, Person, check_drivable
 from sb3_chac.cockpit.recording import FOLDER
-from sb3_chac.cockpit.session import DriveEnded
+from sb3_chac.cockpit.session import SessionEnded
 from sb3_chac.cockpit.window import Window
 from sb3_chac.common.checkpoints import sound_checkpoint
 from sb3_chac.common.demonstrations import load_demonstrations
@@ -282,7 +282,7 @@ def test_losing_the_device_while_the_novice_drives_pauses_without_braking(tmp_pa
     def step():
         try:
             env.step(np.zeros(2, np.float32))
-        except DriveEnded as error:
+        except SessionEnded as error:
             ended.append(error)
 
     thread = threading.Thread(target=step)

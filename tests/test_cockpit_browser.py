@@ -21,10 +21,10 @@ from shell import FOREVER, wait_until
 
 from sb3_chac.__main__ import main
 from sb3_chac.cockpit import server as server_module
-from sb3_chac.cockpit.browser import STALE, Address, BadMessage, Browser, Held, Wish, parse, parse_address
-from sb3_chac.cockpit.env import STANDS
+from sb3_chac.cockpit.devices.browser import STALE, Address, BadMessage, Browser, Held, Wish, parse, parse_address
 from sb3_chac.cockpit.server import MOST_CONNECTIONS, MOST_MESSAGES, MOST_REQUESTS, MOST_VIEWERS, Server, tls_context
-from sb3_chac.cockpit.session import DriveEnded
+from sb3_chac.cockpit.session import SessionEnded
+from sb3_chac.cockpit.wrapper import STANDS
 
 NOVICE = np.array([0.25, 0.0], np.float32)
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
@@ -56,7 +56,7 @@ class Served:
                 self.env.reset(seed=1)
                 while not any(self.env.step(NOVICE)[2:4]):
                     pass
-        except DriveEnded:
+        except SessionEnded:
             pass
 
     async def serve(self):

@@ -16,10 +16,10 @@ from shell import FOREVER, wait_until
 from test_cockpit_browser import CHROMIUM, NOVICE, Served
 
 from sb3_chac.cockpit import server as server_module
-from sb3_chac.cockpit.browser import MOMENT, Address, BadMessage, Browser, Held, Wish, parse
-from sb3_chac.cockpit.env import STANDS
+from sb3_chac.cockpit.devices.browser import MOMENT, Address, BadMessage, Browser, Held, Wish, parse
 from sb3_chac.cockpit.meter import CALM, LEAST, GuidanceMeter
 from sb3_chac.cockpit.session import Display, Novice, asks_for_help, indicators, who_drives
+from sb3_chac.cockpit.wrapper import STANDS
 
 needs_chromium = pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium")
 # Whether there is a touch screen, sizes

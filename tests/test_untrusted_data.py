@@ -14,7 +14,7 @@ from gymnasium.envs.classic_control import PendulumEnv
 from gymnasium.envs.registration import EnvSpec
 
 from sb3_chac.cli.demos import main as demos
-from sb3_chac.cockpit.recording import ABOUT, FOLDER, Recorder, finish_recording
+from sb3_chac.cockpit.recording import ABOUT, FOLDER, CrashSafeRecorder, finish_recording
 from sb3_chac.common.demonstrations import open_dataset
 from sb3_chac.datasets.recording import record
 from sb3_chac.evaluation.episodes import NotEvaluable, check_names_no_code, registered_spec
@@ -59,7 +59,7 @@ def test_a_dataset_names_registered_environments_only(tmp_path, no_code, harm, c
 @pytest.mark.parametrize("harm", EVIL.values(), ids=EVIL)
 def test_a_drive_is_recovered_without_making_its_environment(tmp_path, no_code, harm):
     env = gym.make("Pendulum-v1")
-    recorder = Recorder(tmp_path, env, str(tmp_path / "drive-v0"), "test", 0.1)
+    recorder = CrashSafeRecorder(tmp_path, env, str(tmp_path / "drive-v0"), "test", 0.1)
     observation, _ = env.reset(seed=0)
     recorder.begin(observation, 0, None)
     info = {"applied_action": np.zeros(1, np.float32), "takeover": False, "cost": 0.0}

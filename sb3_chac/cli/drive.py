@@ -201,7 +201,7 @@ def check_arguments(args: argparse.Namespace) -> None:
     import numpy as np
 
     import sb3_chac.envs  # noqa: F401
-    from sb3_chac.cockpit.browser import parse_address
+    from sb3_chac.cockpit.devices.browser import parse_address
     from sb3_chac.datasets.writer import folder_to_make
     from sb3_chac.zoo.algorithms import drivable_algorithms
 
@@ -243,7 +243,7 @@ def drive(args: argparse.Namespace) -> None:
 
     :param args: see ``make_parser``, checked
     """
-    from sb3_chac.cockpit.run import DriveRun
+    from sb3_chac.cockpit.experiment import CockpitRun
 
     if args.serve:
         drive_run = in_browser(args)
@@ -251,7 +251,7 @@ def drive(args: argparse.Namespace) -> None:
         from sb3_chac.cockpit.window import Window
 
         window = Window(f"sb3_chac: {args.algo} on {args.env}")
-        drive_run = DriveRun(args, find_device(args))
+        drive_run = CockpitRun(args, find_device(args))
         try:
             begin(drive_run)
             wait_for_end(window, drive_run)
@@ -283,13 +283,13 @@ def in_browser(args: argparse.Namespace) -> Any:
     :param args: see ``make_parser``, checked
     :return: the run, when it is over
     """
-    from sb3_chac.cockpit.browser import Browser
-    from sb3_chac.cockpit.run import DriveRun
+    from sb3_chac.cockpit.devices.browser import Browser
+    from sb3_chac.cockpit.experiment import CockpitRun
     from sb3_chac.cockpit.server import serve, tls_context
 
     tls = tls_context(args.tls_cert, args.tls_key) if args.tls_cert else None
     device = Browser()
-    drive_run = DriveRun(args, device)
+    drive_run = CockpitRun(args, device)
     asyncio.run(serve(drive_run.drive, device, args.serve, lambda: begin(drive_run), lambda: drive_run.is_over, tls))
     drive_run.thread.join()
     return drive_run

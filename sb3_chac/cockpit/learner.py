@@ -19,7 +19,7 @@ from stable_baselines3.common.type_aliases import MaybeCallback
 
 from sb3_chac.chac import CHAC
 from sb3_chac.cockpit.meter import GuidanceMeter
-from sb3_chac.cockpit.session import Drive, DriveEnded, Novice
+from sb3_chac.cockpit.session import Novice, Session, SessionEnded
 from sb3_chac.common.critics import DistributionalCritic
 from sb3_chac.common.guided import GuidedOffPolicyAlgorithm
 from sb3_chac.hg_dagger import HGDagger
@@ -42,7 +42,7 @@ class Learner(threading.Thread):
     :param drive: beside which it learns
     """
 
-    def __init__(self, model: "DrivenTraining", drive: Drive) -> None:
+    def __init__(self, model: "DrivenTraining", drive: Session) -> None:
         super().__init__(name="learner", daemon=True)
         self.model, self.drive = model, drive
         self.error: BaseException | None = None
@@ -127,11 +127,11 @@ class DrivenTraining(Base):
     algorithm does it: the car waits, and the display says so.
     """
 
-    drive: Drive
+    drive: Session
     owed_steps = 0  # gradient steps; saved, so that they are made after a restart
     driven_seconds = 0.0
 
-    def attach(self, drive: Drive) -> None:
+    def attach(self, drive: Session) -> None:
         """
         To be called before ``learn``.
 
@@ -306,7 +306,7 @@ class DrivenTraining(Base):
             super().learn(*args, **kwargs)
             self.drive.busy = "The last gradient steps are made" if self.owed_steps else ""
             self.learner.drain()
-        except DriveEnded:
+        except SessionEnded:
             self._callback.on_training_end()
         finally:
             self.drive.busy = ""

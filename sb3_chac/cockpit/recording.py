@@ -69,7 +69,7 @@ class Summary:
         return "\n".join(lines)
 
 
-class Recorder:
+class CrashSafeRecorder:
     """
     Writes each episode into a file of its own once it ends; ``finish`` makes the dataset of them. What a process that was
     killed has left, ``finish_recording`` makes a dataset of later.
@@ -180,7 +180,7 @@ class RecordedEnv(gym.Env):
     """
     What is known of an environment that was recorded, to be written down. It is never made: a file runs no code.
 
-    :param about: what ``Recorder`` has written
+    :param about: what ``CrashSafeRecorder`` has written
     :raises DatasetError: if that is damaged
     """
 

@@ -29,9 +29,9 @@ try:
 except ImportError as error:
     raise RuntimeError('--serve needs aiohttp and segno: pip install "aiohttp>=3.10" segno.') from error
 
-from sb3_chac.cockpit.browser import Address, BadMessage, Browser, Held, Wish, is_number, parse
 from sb3_chac.cockpit.devices import Clock
-from sb3_chac.cockpit.session import Drive, asks_for_help, indicators, who_drives
+from sb3_chac.cockpit.devices.browser import Address, BadMessage, Browser, Held, Wish, is_number, parse
+from sb3_chac.cockpit.session import Session, asks_for_help, indicators, who_drives
 
 logger = logging.getLogger(__name__)
 
@@ -113,7 +113,7 @@ class Server:
 
     def __init__(
         self,
-        drive: Drive,
+        drive: Session,
         device: Browser,
         address: Address,
         tls: ssl.SSLContext | None = None,
@@ -435,7 +435,7 @@ def tls_context(certificate: Path, key: Path | None) -> ssl.SSLContext:
 
 
 async def serve(
-    drive: Drive,
+    drive: Session,
     device: Browser,
     address: Address,
     begin: Callable[[], None],

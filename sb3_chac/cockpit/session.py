@@ -13,7 +13,7 @@ from sb3_chac.cockpit.person import Person
 TO_BEGIN = "Ready: P begins"
 
 
-class DriveEnded(Exception):
+class SessionEnded(Exception):
     """Raised in the driving thread when the person has quit. The environment has not made the step."""
 
 
@@ -78,7 +78,7 @@ class Display:
         return self.human_steps / self.total_steps if self.total_steps else 0.0
 
 
-class Drive:
+class Session:
     """
     One drive. The driving thread waits in ``wait_for_tick``; everything else may be called from any thread.
 
@@ -164,12 +164,12 @@ class Drive:
         """
         Returns when the next step is due, ``period`` after the last one at the earliest; in a pause, when it is over.
 
-        :raises DriveEnded: if the person has quit
+        :raises SessionEnded: if the person has quit
         """
         with self._changed:
             while True:
                 if self.ended:
-                    raise DriveEnded
+                    raise SessionEnded
                 if self.paused and not self._skip:
                     self._changed.wait()
                     continue

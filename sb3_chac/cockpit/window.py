@@ -9,7 +9,7 @@ import numpy as np
 import pygame
 
 from sb3_chac.cockpit.devices import Command, Keyboard
-from sb3_chac.cockpit.session import Display, Drive, asks_for_help, indicators, who_drives
+from sb3_chac.cockpit.session import Display, Session, asks_for_help, indicators, who_drives
 from sb3_chac.envs.driving.display import BLACK, EGO, HUMAN, ORANGE, PANEL, RED, TEXT
 
 PICTURE = pygame.Rect(0, 0, 800, 600)
@@ -52,7 +52,7 @@ class Window:
     :raises RuntimeError: if no window can be opened
     """
 
-    drive: Drive
+    drive: Session
 
     def __init__(self, title: str) -> None:
         try:
@@ -74,7 +74,7 @@ class Window:
         self._drawn_at = 0.0
         self._picture: tuple[Any, pygame.Surface] | None = None
 
-    def run(self, drive: Drive, is_over: Callable[[], bool]) -> None:
+    def run(self, drive: Session, is_over: Callable[[], bool]) -> None:
         """
         Show a drive until it is over.
 

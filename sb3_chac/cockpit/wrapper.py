@@ -5,8 +5,8 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from sb3_chac.cockpit.recording import Recorder
-from sb3_chac.cockpit.session import Drive, lost_message
+from sb3_chac.cockpit.recording import CrashSafeRecorder
+from sb3_chac.cockpit.session import Session, lost_message
 from sb3_chac.common.contract import TakeoverDisplay
 from sb3_chac.human.intervention import ControlState, InterventionWrapper
 
@@ -31,7 +31,7 @@ class Cockpit(gym.Wrapper):
 
     env: InterventionWrapper
 
-    def __init__(self, env: InterventionWrapper, drive: Drive, recorder: Recorder) -> None:
+    def __init__(self, env: InterventionWrapper, drive: Session, recorder: CrashSafeRecorder) -> None:
         super().__init__(env)
         self.drive, self.recorder = drive, recorder
         self.steps = 0  # of the episode

@@ -14,11 +14,11 @@ from rl_zoo3.utils import ALGOS
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_chac.cockpit.devices import Device
-from sb3_chac.cockpit.env import Cockpit
 from sb3_chac.cockpit.learner import DrivenTraining, driven
 from sb3_chac.cockpit.person import NotDrivable, Person, check_drivable
-from sb3_chac.cockpit.recording import Recorder, Summary
-from sb3_chac.cockpit.session import Drive
+from sb3_chac.cockpit.recording import CrashSafeRecorder, Summary
+from sb3_chac.cockpit.session import Session
+from sb3_chac.cockpit.wrapper import Cockpit
 from sb3_chac.common.checkpoints import ResumableCheckpoint
 from sb3_chac.human.intervention import InterventionWrapper
 from sb3_chac.zoo import register
@@ -43,7 +43,7 @@ class EpisodeCheckpoint(ResumableCheckpoint):
             super()._on_rollout_start()
 
 
-class DriveManager(ExperimentManager):
+class CockpitExperiment(ExperimentManager):
     """
     RL-Zoo3's experiment in which a person drives: hyperparameters, folders and files are those of ``rl_zoo3 train``. There is
     one environment; in the place of the yaml's ``InterventionWrapper`` stands the person's.
@@ -86,7 +86,7 @@ class DriveManager(ExperimentManager):
         return found, wrap, callbacks, vec_env_wrapper
 
 
-class DriveRun:
+class CockpitRun:
     """
     One drive, in a thread of its own: environment, model and all that is written belong to it.
 
@@ -97,7 +97,7 @@ class DriveRun:
     def __init__(self, args: argparse.Namespace, device: Device) -> None:
         register()
         self.args = args
-        self.drive = Drive(Person(device), args.rate or DEFAULT_RATE, args.query)
+        self.drive = Session(Person(device), args.rate or DEFAULT_RATE, args.query)
         self.summary: Summary | None = None
         self.run_folder: Path | None = None
         self.error: BaseException | None = None
@@ -121,7 +121,7 @@ class DriveRun:
         algorithm = drivable_algorithms()[args.algo]
         ALGOS[args.algo] = driven(algorithm)
         try:
-            self.manager = DriveManager(self._wrap, args)
+            self.manager = CockpitExperiment(self._wrap, args)
             self.run_folder = Path(self.manager.save_path)
             with contextlib.redirect_stdout(io.StringIO()) if args.verbose == 0 else contextlib.nullcontext():
                 model, _ = self.manager.setup_experiment()  # type: ignore[misc]
@@ -165,6 +165,6 @@ class DriveRun:
             self.drive.period = 1 / float(env.metadata.get("render_fps") or DEFAULT_RATE)
         assert self.run_folder is not None
         watched = InterventionWrapper(env, expert=person, rule=person.drives)
-        recorder = Recorder(self.run_folder, env, args.dataset, f"{args.algo} and a person", self.drive.period)
+        recorder = CrashSafeRecorder(self.run_folder, env, args.dataset, f"{args.algo} and a person", self.drive.period)
         self.cockpit = Cockpit(watched, self.drive, recorder)
         return self.cockpit
