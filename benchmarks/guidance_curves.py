@@ -1,4 +1,4 @@
-"""The CSVs of guidance.py as curves, for its own pictures and those of headline.py."""
+"""The CSVs of guidance.py as curves, for its own pictures and those of tables.py."""
 
 import csv
 from pathlib import Path
