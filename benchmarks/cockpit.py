@@ -18,8 +18,6 @@ It wants a machine with two cores that does nothing else; the load average is in
 
 import argparse
 import asyncio
-import csv
-import importlib.metadata
 import os
 import random
 import shutil
@@ -33,11 +31,12 @@ from typing import Any
 os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+import lab
 import numpy as np
 import pygame
 import torch as th
 
-from sb3_chac import drive as command
+from sb3_chac.cli import drive as command
 from sb3_chac.cockpit.devices import Device, Keyboard
 from sb3_chac.cockpit.devices.browser import Address, Browser
 from sb3_chac.cockpit.devices.emulator import DeviceEmulator
@@ -49,9 +48,7 @@ PICTURES = Path(command.__file__).parent / "cockpit" / "images"
 KEYS = (pygame.K_LEFT, pygame.K_RIGHT, pygame.K_UP, pygame.K_DOWN, pygame.K_SPACE)
 OLD = {"chac": ("--env-kwargs", "corridors:False")}  # without which this agent was trained
 PERIOD = 0.1  # [s] of a step, as the environments say
-VERSIONS = " ".join(
-    f"{name}={importlib.metadata.version(name)}" for name in ("sb3_chac", "torch", "numpy", "pygame-ce", "stable-baselines3")
-)
+VERSIONS = lab.versions("sb3_chac", "torch", "numpy", "pygame-ce", "stable-baselines3")
 
 
 class Person(threading.Thread):
@@ -221,7 +218,7 @@ def measure_browser(env: str, minutes: float) -> None:
         asyncio.run(all_of_it())
         if run.error is not None:
             raise run.error
-    write_table("browser", rows)
+    lab.write(RESULTS / "browser.csv", rows)
     report()
 
 
@@ -243,17 +240,9 @@ def write(env: str, steps: list[dict[str, Any]], events: list[float]) -> None:
     for step in steps:
         step["time"] = round(step["time"] - first, 5)
         del step["heard"]
-    write_table(f"{env}-events", rows)
-    write_table(f"{env}-steps", [step | facts for step in steps])
+    lab.write(RESULTS / f"{env}-events.csv", rows)
+    lab.write(RESULTS / f"{env}-steps.csv", [step | facts for step in steps])
     report()
-
-
-def write_table(name: str, rows: list[dict[str, Any]]) -> None:
-    RESULTS.mkdir(parents=True, exist_ok=True)
-    with (RESULTS / f"{name}.csv").open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
 
 
 def report() -> None:
@@ -262,7 +251,7 @@ def report() -> None:
         report_browser()
     for file in sorted(RESULTS.glob("*-events.csv")):
         env = file.name.removesuffix("-events.csv")
-        events, steps = (list(csv.DictReader((RESULTS / f"{env}-{kind}.csv").open())) for kind in ("events", "steps"))
+        events, steps = (lab.read(RESULTS / f"{env}-{kind}.csv") for kind in ("events", "steps"))
         latency = np.array([float(row["latency_ms"]) for row in events])
         times = np.array([float(row["time"]) for row in steps])
         lag, frames = (np.array([int(row[name]) for row in steps]) for name in ("lag", "frames"))
@@ -280,7 +269,7 @@ def report() -> None:
 
 
 def report_browser() -> None:
-    rows = list(csv.DictReader((RESULTS / "browser.csv").open()))
+    rows = lab.read(RESULTS / "browser.csv")
     print(f"Chromium on loopback, load average {rows[0]['load']}")
     for kind in ("round trip", "shown", "applied", "touch shown", "touch applied"):
         times = np.array([float(row["ms"]) for row in rows if row["kind"] == kind])

@@ -12,12 +12,12 @@ of their root mean square less ``cost_coef`` per collision, as in Z_c. Bars: 95 
 import argparse
 import copy
 import csv
-import importlib.metadata
 from collections import OrderedDict
 from itertools import pairwise
 from pathlib import Path
 
 import gymnasium as gym
+import lab
 import numpy as np
 import torch as th
 
@@ -67,7 +67,7 @@ def run(args: argparse.Namespace) -> None:
         raise SystemExit(f"{args.model} is in stage 1, there is no pi_r yet.")
     env = gym.make("SafeDrive-v0").unwrapped
     assert isinstance(env, SafeDriveEnv)
-    versions = " ".join(f"{name}={importlib.metadata.version(name)}" for name in ("torch", "stable-baselines3", "numpy"))
+    versions = lab.versions("torch", "stable-baselines3", "numpy")
     args.results.mkdir(parents=True, exist_ok=True)
     rows, scenario = 0, FIRST_MAP
     with (args.results / "rollouts.csv").open("w", newline="") as file:
@@ -110,8 +110,7 @@ def report(args: argparse.Namespace) -> None:
     matplotlib.use("Agg")
     from matplotlib import pyplot as plt
 
-    with (args.results / "rollouts.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
+    rows = lab.read(args.results / "rollouts.csv")
     confidence = np.array([float(row["confidence"]) for row in rows])
     gain = np.array([float(row["return_self"]) - float(row["return_guided"]) for row in rows])
     print("| P(Q_r > Q_g) | states | pi_r did better | mean gain |")

@@ -12,11 +12,11 @@ from 1 to 0, is driven by the driver.
 """
 
 import argparse
-import csv
 import time
 from pathlib import Path
 
 import gymnasium as gym
+import lab
 import numpy as np
 import torch as th
 from torch import nn
@@ -117,12 +117,7 @@ def main() -> None:
                 "route_completion": round(completion, 3),
             }
             print("test:", row, f"{time.process_time() - start:.0f} s", flush=True)
-            out.parent.mkdir(parents=True, exist_ok=True)
-            with out.open("a", newline="") as file:
-                writer = csv.DictWriter(file, list(row))
-                if file.tell() == 0:
-                    writer.writeheader()
-                writer.writerow(row)
+            lab.append(out, row)
 
 
 if __name__ == "__main__":

@@ -12,7 +12,6 @@ A simulated clock ticks in ``link`` and ``cuts``, so that their rows do not depe
 """
 
 import argparse
-import csv
 import gc
 import platform
 import resource
@@ -24,6 +23,7 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import lab
 import numpy as np
 
 import sb3_chac.envs  # noqa: F401
@@ -51,25 +51,6 @@ MAX_BRAKING = 4.0  # [m/s2]
 CUT_AFTER = (3.0, 12.0)  # [s] of an episode
 
 
-def rows_of(file: Path) -> list[dict[str, str]]:
-    """Return what is there already."""
-    if not file.is_file():
-        return []
-    with file.open(newline="") as lines:
-        return list(csv.DictReader(lines))
-
-
-def append(file: Path, row: dict[str, Any]) -> None:
-    """Write a row, with a header if it is the first."""
-    file.parent.mkdir(parents=True, exist_ok=True)
-    is_new = not file.exists()
-    with file.open("a", newline="") as lines:
-        writer = csv.DictWriter(lines, list(row))
-        if is_new:
-            writer.writeheader()
-        writer.writerow(row)
-
-
 def exported(agent: str, folder: Path) -> Path:
     """Export a committed agent."""
     file = folder / f"{agent}.onnx"
@@ -85,7 +66,7 @@ def compare_exports(out: Path, folder: Path, steps: int) -> None:
     from sb3_chac.deploy.export import compare
     from sb3_chac.evaluation.models import find_algorithm, load_model
 
-    done = {row["agent"] for row in rows_of(out / "export.csv")}
+    done = {row["agent"] for row in lab.read(out / "export.csv")}
     for agent, kwargs in AGENTS.items():
         if agent in done:
             continue
@@ -94,7 +75,7 @@ def compare_exports(out: Path, folder: Path, steps: int) -> None:
         model = load_model(path, algo, algorithm, env)
         result = compare(model, OnnxPolicy(exported(agent, folder)), env, steps, scenarios=list(range(1000, 1200)))
         row = {"agent": agent, "observations": result.steps, "difference": f"{result.difference:.3g}"}
-        append(out / "export.csv", row | {"other_source": result.other_source})
+        lab.append(out / "export.csv", row | {"other_source": result.other_source})
 
 
 COLD = """
@@ -147,7 +128,7 @@ def measure_latency(out: Path, folder: Path, decisions: int) -> None:
             row["cold_start_s"] = f"{min(start[0] for start in starts):.3f}" if starts else ""
             row["memory_mib"] = f"{max(start[1] for start in starts):.0f}" if starts else ""
             row |= {"processor": processor(), "load": f"{load():.1f}"}
-            append(out / "latency.csv", row)
+            lab.append(out / "latency.csv", row)
 
 
 def cold_start(file: Path) -> tuple[float, float]:
@@ -238,7 +219,7 @@ def drive(env: SafeDriveEnv, policy: OnnxPolicy, scenario: int, copies: int) -> 
 def drive_maps(out: Path, folder: Path, maps: int) -> None:
     """Drive the maps directly, and over the link with each packet sent once and twice."""
     policy = OnnxPolicy(exported(DRIVER, folder))
-    done = {(row["copies"], row["scenario"]) for row in rows_of(out / "link.csv")}
+    done = {(row["copies"], row["scenario"]) for row in lab.read(out / "link.csv")}
     for scenario in range(1000, 1000 + maps):
         for copies in (0, 2, 1):
             if (str(copies), str(scenario)) in done:
@@ -250,13 +231,13 @@ def drive_maps(out: Path, folder: Path, maps: int) -> None:
             row = {"copies": copies, "scenario": scenario, "success": int(info["is_success"]), "cost": cost, "steps": steps}
             ticks = env.ticks if isinstance(env, LinkedDrive) else [State.NOMINAL]
             row |= {state.name.lower(): f"{ticks.count(state) / len(ticks):.4f}" for state in State}
-            append(out / "link.csv", row | {"out_of_road": int(info["out_of_road"])})
+            lab.append(out / "link.csv", row | {"out_of_road": int(info["out_of_road"])})
 
 
 def cut_links(out: Path, folder: Path, cuts: int) -> None:
     """Cut the link at a random time of a drive and wait until the vehicle stands."""
     policy = OnnxPolicy(exported(DRIVER, folder))
-    done = {row["cut"] for row in rows_of(out / "cuts.csv")}
+    done = {row["cut"] for row in lab.read(out / "cuts.csv")}
     for number in range(cuts):
         if str(number) in done:
             continue
@@ -273,7 +254,7 @@ def cut_links(out: Path, folder: Path, cuts: int) -> None:
         moments = env.since_cut
         row: dict[str, Any] = {"cut": number, "scenario": env.scenario, "after_s": f"{after:.2f}"}
         if not moments:  # it had arrived
-            append(out / "cuts.csv", row | dict.fromkeys(CUT_COLUMNS, ""))
+            lab.append(out / "cuts.csv", row | dict.fromkeys(CUT_COLUMNS, ""))
             continue
         speed = moments[0][1]
         braked = next((moment for moment in moments if moment[2] == State.BRAKE), moments[-1])
@@ -290,7 +271,7 @@ def cut_links(out: Path, folder: Path, cuts: int) -> None:
             "out_of_road": int(info["out_of_road"]),
             "arrived": int(info["is_success"]),
         }
-        append(out / "cuts.csv", row)
+        lab.append(out / "cuts.csv", row)
 
 
 CUT_COLUMNS = (
@@ -300,17 +281,17 @@ CUT_COLUMNS = (
 
 def report(out: Path) -> None:
     """Print what the CSVs hold."""
-    for row in rows_of(out / "export.csv"):
+    for row in lab.read(out / "export.csv"):
         print(f"{row['agent']}: {row['observations']} observations, differences up to {row['difference']}, "
               f"another policy drives in {row['other_source']}")  # fmt: skip
-    for row in rows_of(out / "latency.csv"):
+    for row in lab.read(out / "latency.csv"):
         print(", ".join(f"{key} {value}" for key, value in row.items() if value))
-    rows = rows_of(out / "link.csv")
+    rows = lab.read(out / "link.csv")
     for copies in sorted({row["copies"] for row in rows}):
         chosen = [row for row in rows if row["copies"] == copies]
         figures = {key: np.mean([float(row[key]) for row in chosen]) for key in ("success", "cost", "steps", "hold", "brake")}
         print(f"copies {copies}: {len(chosen)} maps, " + ", ".join(f"{key} {value:.3f}" for key, value in figures.items()))
-    rows = [row for row in rows_of(out / "cuts.csv") if row["speed"]]
+    rows = [row for row in lab.read(out / "cuts.csv") if row["speed"]]
     if rows:
         values = {key: np.array([float(row[key]) for row in rows]) for key in CUT_COLUMNS}
         within = values["distance_m"] <= values["allowed_m"] + 1e-9

@@ -13,23 +13,21 @@ stage 2 that was cut off goes on from its last evaluation; others (half an hour 
 """
 
 import argparse
-import csv
 import functools
-import importlib.metadata
 import io
-import json
-import multiprocessing
 import shutil
 import time
 import zipfile
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import lab
 import numpy as np
+import tables
 import torch as th
 import yaml
-from guidance_curves import load_run, read
+from guidance_curves import load_run
+from lab import read
 from rl_zoo3.utils import ALGOS, get_wrapper_class
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
@@ -49,6 +47,7 @@ RESULTS = {
     "SafeDrive-v0": HERE / "results" / "guidance",
     "MetaDriveSafety-v0": HERE / "results" / "guidance-metadrive",
 }
+PACKAGES = ("torch", "stable-baselines3", "gymnasium", "numpy")
 SIMULATORS = {"SafeDrive-v0": "highway-env", "MetaDriveSafety-v0": "metadrive-simulator"}
 TEST_MAPS, TUNING_MAPS = range(1000, 1200), range(2000, 2200)
 FIRST_TUNING_SEED = 100
@@ -88,11 +87,6 @@ ACTING = {
 }
 
 
-def versions(env_id: str) -> str:
-    names = ("torch", "stable-baselines3", "gymnasium", SIMULATORS[env_id], "numpy")
-    return " ".join(f"{name}={importlib.metadata.version(name)}" for name in names)
-
-
 def make_model(algo: str, seed: int, env_id: str, budget: int | None = None, **overrides: Any) -> BaseAlgorithm:
     """As ``rl_zoo3 train --algo <algo> --env <env_id>`` makes it, with another budget of the human if there is one."""
     params = yaml.safe_load(hyperparams_file(algo).read_text())[env_id]
@@ -128,7 +122,7 @@ class Record(BaseCallback):
         :param save_to: model and transitions at each evaluation, nothing if None
         """
         super().__init__()
-        self.env_id, self.versions = env_id, versions(env_id)
+        self.env_id, self.versions = env_id, lab.versions(*PACKAGES, SIMULATORS[env_id])
         self.path, self.labels, self.every, self.maps = path, labels, every, maps
         self.training_cost = training_cost
         self.save_to = save_to
@@ -142,12 +136,7 @@ class Record(BaseCallback):
             row |= {"human_steps": int(counts.get("human_steps", 0)), "training_cost": int(self.training_cost)}
             row |= {"training_cost_human": int(counts.get("safety_cost_human", 0))}
             row |= {"cpu_seconds": round(time.process_time()), "versions": self.versions}
-            is_new = not self.path.exists()
-            with self.path.open("a", newline="") as file:
-                writer = csv.DictWriter(file, list(row))
-                if is_new:
-                    writer.writeheader()
-                writer.writerow(row)
+            lab.append(self.path, row)
             if self.save_to is not None:
                 self.model.save(self.save_to)
                 self.model.save_replay_buffer(self.save_to.with_suffix(".pkl"))
@@ -188,13 +177,12 @@ def run(
 
 def forget_rows_after(path: Path, step: int) -> None:
     """Drop evaluations of a state that was not saved: they will be made again."""
-    rows = read(path) if path.exists() else []
+    rows = read(path)
     kept = [row for row in rows if int(row["step"]) <= step]
     if len(kept) < len(rows):
-        with path.open("w", newline="") as file:
-            writer = csv.DictWriter(file, list(rows[0]))
-            writer.writeheader()
-            writer.writerows(kept)
+        path.unlink()
+        if kept:
+            lab.append(path, *kept)
 
 
 def is_finished(path: Path, method: Config, most_steps: int) -> bool:
@@ -211,90 +199,24 @@ def run_all(args: argparse.Namespace) -> None:
             and not is_finished(args.results / f"{name}-{seed}.csv", METHODS[name], args.steps)
         ]
 
-    context = multiprocessing.get_context("spawn")
+    arguments = (args.every, args.results, args.models, args.env, args.steps)
     for go_on in (False, True):  # from what the first round leaves
-        with ProcessPoolExecutor(args.jobs, mp_context=context, max_tasks_per_child=1) as pool:
-            arguments = (args.every, args.results, args.models, args.env, args.steps)
-            futures = [pool.submit(run, *job, *arguments) for job in missing(go_on)]
-            for future in as_completed(futures):
-                print(future.result(), flush=True)
-
-
-def columns(runs: list[list[dict[str, str]]], key: str) -> np.ndarray:
-    """
-    :return: shape (n_runs, n_evaluations)
-    """
-    return np.array([[float(row[key]) for row in rows] for rows in runs])
+        lab.run_all([(run, *job, *arguments) for job in missing(go_on)], args.jobs)
 
 
 def report(args: argparse.Namespace) -> None:
-    """Table: last three evaluations, mean ± standard deviation over seeds. Curves: see ``curves.draw``."""
-    titles = {"success_rate": "success rate", "cost_mean": "safety cost", "return_mean": "return"}
+    """Print the tables, and draw the curves (see ``curves.draw``)."""
+    print(tables.guidance(args.results))
+    print()
+    print(tables.ablations(args.results, AFTER_SWITCH))
     drawn = []
-    print("| method | seeds | steps | human steps | return | cost | success | training cost |")
-    print("|---|---|---|---|---|---|---|---|")
-    rows = []
     for name, method in METHODS.items():
-        seeds = [seed for seed in args.seeds if is_finished(args.results / f"{name}-{seed}.csv", method, args.steps)]
-        if not seeds:
-            continue
-        if not any(other.goes_on_from == name for other in METHODS.values()):
+        seeds = [seed for seed in args.seeds if (args.results / f"{name}-{seed}.csv").exists()]
+        if seeds and not any(other.goes_on_from == name for other in METHODS.values()):
             drawn.append(Method(method.title, [load_run(args.results, name, seed, method.goes_on_from) for seed in seeds]))
-        runs = [read(args.results / f"{name}-{seed}.csv") for seed in seeds]
-        runs = [rows[: min(map(len, runs))] for rows in runs]
-        scores = {key: columns(runs, key)[:, -3:].mean(axis=1) for key in titles}
-        scores |= {key: columns(runs, key)[:, -1] for key in ("human_steps", "training_cost")}
-        text = {key: f"{s.mean():.2f}" + (f" ± {s.std(ddof=1):.2f}" if len(s) > 1 else "") for key, s in scores.items()}
-        whole = {key: f"{scores[key].mean():.0f}" for key in ("human_steps", "training_cost")}
-        steps = columns(runs, "step")[0]
-        print(
-            f"| {method.title} | {len(runs)} | {steps[-1] / 1000:.0f}K | {whole['human_steps']} | {text['return_mean']} "
-            f"| {text['cost_mean']} | {text['success_rate']} | {whole['training_cost']} |"
-        )
-        rows.append({"method": name, "seeds": len(runs), **{key: float(s.mean()) for key, s in scores.items()}})
-    (args.results / "ablation.json").write_text(json.dumps(report_switch(args), indent=2) + "\n")
     figure = curves.draw(drawn, (curves.RETURN, curves.SUCCESS, curves.COST, curves.TRAINING_COST))
     figure.axes[-1].set_yscale("symlog", linthresh=10)
     figure.savefig(args.results / "curves.png", dpi=90)
-    (args.results / "summary.json").write_text(json.dumps(rows, indent=2) + "\n")
-
-
-def report_switch(args: argparse.Namespace) -> list[dict[str, Any]]:
-    """Table: what the switch to stage 2 costs in the steps after it, for C-HAC and its ablations (the paper's Figure 8)."""
-    titles = ("seeds", "lowest return", "drop", "lowest success", "training cost since the switch")
-    print(f"\n| in {AFTER_SWITCH // 1000}K steps after the switch | {' | '.join(titles)} |")
-    print("|---|---|---|---|---|---|")
-    rows = []
-    for name, method in METHODS.items():
-        if method.goes_on_from is None:
-            continue
-        drops = []
-        for seed in args.seeds:
-            before, after = args.results / f"{method.goes_on_from}-{seed}.csv", args.results / f"{name}-{seed}.csv"
-            if not is_finished(after, method, args.steps):
-                continue
-            start = read(before)[-1]
-            end = int(start["step"]) + AFTER_SWITCH
-            after_switch = [row for row in read(after) if int(row["step"]) <= end]
-            lowest = min(float(row["return_mean"]) for row in after_switch)
-            drops.append(
-                {
-                    "return": lowest,
-                    "drop": 1 - lowest / float(start["return_mean"]),
-                    "success": min(float(row["success_rate"]) for row in after_switch),
-                    "training_cost": float(after_switch[-1]["training_cost"]) - float(start["training_cost"]),
-                }
-            )
-        if drops:
-            means = {key: float(np.mean([drop[key] for drop in drops])) for key in drops[0]}
-            spread = {key: np.std([drop[key] for drop in drops], ddof=1) if len(drops) > 1 else 0.0 for key in means}
-            print(
-                f"| {method.title} | {len(drops)} | {means['return']:.0f} ± {spread['return']:.0f} | {means['drop']:.1%} "
-                f"| {means['success']:.2f} ± {spread['success']:.2f} "
-                f"| {means['training_cost']:.0f} ± {spread['training_cost']:.0f} |"
-            )
-            rows.append({"method": name, "seeds": len(drops), **means})
-    return rows
 
 
 class GuidedDSAC(GuidedOffPolicyAlgorithm, DSAC):
@@ -319,7 +241,7 @@ def cost(args: argparse.Namespace) -> None:
                 {
                     "part": part,
                     "kind": name,
-                    "versions": versions("SafeDrive-v0"),
+                    "versions": lab.versions(*PACKAGES, SIMULATORS["SafeDrive-v0"]),
                     "cpu_ms_per_step": round(time.process_time() - start, 4),
                 }
             )
@@ -327,10 +249,7 @@ def cost(args: argparse.Namespace) -> None:
     ratios = np.array(times["guided"]) / np.array(times["plain"])
     print({name: f"{np.median(values):.2f} ms" for name, values in times.items()}, end=" ")
     print(f"guided / plain: median {np.median(ratios):.3f}, {ratios.min():.3f} to {ratios.max():.3f} in ten rounds")
-    with (args.results / "cost.csv").open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
+    lab.write(args.results / "cost.csv", rows)
 
 
 def agents(args: argparse.Namespace) -> None:

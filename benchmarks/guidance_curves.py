@@ -1,8 +1,8 @@
 """The CSVs of guidance.py as curves, for its own pictures and those of tables.py."""
 
-import csv
 from pathlib import Path
 
+import lab
 import numpy as np
 
 from sb3_chac.evaluation import curves
@@ -15,11 +15,6 @@ COLUMNS = {
     "training_cost": curves.TRAINING_COST,
     "human_steps": curves.HUMAN_STEPS,
 }
-
-
-def read(path: Path) -> list[dict[str, str]]:
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
 
 
 def to_curves(rows: list[dict[str, str]], stage: int) -> Curves:
@@ -38,7 +33,7 @@ def load_run(folder: Path, name: str, seed: int, goes_on_from: str | None = None
     :param goes_on_from: the method of its stage 1, None if it has none
     :return: both stages as one curve
     """
-    run = to_curves(read(folder / f"{name}-{seed}.csv"), 2 if goes_on_from else 1)
+    run = to_curves(lab.read(folder / f"{name}-{seed}.csv"), 2 if goes_on_from else 1)
     if goes_on_from is None:
         return run
-    return curves.join_curves(to_curves(read(folder / f"{goes_on_from}-{seed}.csv"), 1), run)
+    return curves.join_curves(to_curves(lab.read(folder / f"{goes_on_from}-{seed}.csv"), 1), run)

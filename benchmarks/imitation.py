@@ -10,15 +10,12 @@ row per evaluation as it comes; a run that was cut off starts anew. The experts 
 """
 
 import argparse
-import csv
-import importlib.metadata
-import multiprocessing
 import time
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import gymnasium as gym
+import lab
 import numpy as np
 import torch as th
 import yaml
@@ -38,26 +35,7 @@ HERE = Path(__file__).parent
 RESULTS = HERE / "results" / "imitation"
 TEST_MAPS = range(1000, 1050)
 N_ROUNDS = 4
-VERSIONS = " ".join(
-    f"{name}={importlib.metadata.version(name)}"
-    for name in ("torch", "stable-baselines3", "gymnasium", "highway-env", "numpy")
-)
-
-
-def append(path: Path, row: dict[str, Any]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("a", newline="") as file:
-        writer = csv.DictWriter(file, [*row, "versions"])
-        if file.tell() == 0:
-            writer.writeheader()
-        writer.writerow(row | {"versions": VERSIONS})
-
-
-def read(path: Path) -> list[dict[str, str]]:
-    if not path.exists():
-        return []
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
+VERSIONS = lab.versions("torch", "stable-baselines3", "gymnasium", "highway-env", "numpy")
 
 
 # HG-DAgger and IWR
@@ -81,7 +59,7 @@ class AfterEachFit(BaseCallback):
         self.evaluated += 1
         summary = {key: round(value, 4) for key, value in evaluate(self.model, "SafeDrive-v0", TEST_MAPS).summary().items()}
         counts = {key: int(self.model.counts[key]) for key in ("total_steps", "human_steps", "safety_cost")}
-        append(self.path, self.labels | {"round": self.evaluated - 1} | counts | summary)
+        lab.append(self.path, self.labels | {"round": self.evaluated - 1} | counts | summary | {"versions": VERSIONS})
 
 
 def imitate_in_rounds(algo: str, seed: int) -> str:
@@ -176,15 +154,8 @@ def imitate_by_discriminator(env_id: str, seed: int, folder: Path) -> str:
             model.learn(task.steps // 10, reset_num_timesteps=False)
         returns = evaluate_policy(model, evaluation_env, 20, return_episode_rewards=True)[0]
         row = {"step": model.num_timesteps, "return_mean": round(np.mean(returns), 1), "return_std": round(np.std(returns), 1)}
-        append(path, labels | row | {"cpu_seconds": round(time.process_time())})
+        lab.append(path, labels | row | {"cpu_seconds": round(time.process_time()), "versions": VERSIONS})
     return f"GAIL {env_id} seed {seed}: {time.process_time():.0f} CPU seconds"
-
-
-def run_all(jobs: int, calls: list[tuple[Any, ...]]) -> None:
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(jobs, mp_context=context, max_tasks_per_child=1) as pool:
-        for future in as_completed([pool.submit(*call) for call in calls]):
-            print(future.result(), flush=True)
 
 
 def rounds(args: argparse.Namespace) -> None:
@@ -192,9 +163,9 @@ def rounds(args: argparse.Namespace) -> None:
         (imitate_in_rounds, algo, seed)
         for seed in args.seeds
         for algo in ("hg_dagger", "iwr")
-        if len(read(RESULTS / f"{algo}-{seed}.csv")) < N_ROUNDS + 1
+        if len(lab.read(RESULTS / f"{algo}-{seed}.csv")) < N_ROUNDS + 1
     ]
-    run_all(args.jobs, missing)
+    lab.run_all(missing, args.jobs)
 
 
 def gail(args: argparse.Namespace) -> None:
@@ -204,9 +175,9 @@ def gail(args: argparse.Namespace) -> None:
         (imitate_by_discriminator, env_id, seed, args.work)
         for env_id in args.envs
         for seed in args.seeds
-        if len(read(RESULTS / f"gail-{env_id}-{seed}.csv")) < 11
+        if len(lab.read(RESULTS / f"gail-{env_id}-{seed}.csv")) < 11
     ]
-    run_all(args.jobs, missing)
+    lab.run_all(missing, args.jobs)
 
 
 def report(args: argparse.Namespace) -> None:
@@ -219,7 +190,7 @@ def report(args: argparse.Namespace) -> None:
     print("| method | seeds | after round | human steps | all steps | success | cost | return |")
     print("|---" * 8 + "|")
     for algo in ("hg_dagger", "iwr"):
-        runs = [run for seed in args.seeds if len(run := read(RESULTS / f"{algo}-{seed}.csv")) == N_ROUNDS + 1]
+        runs = [run for seed in args.seeds if len(run := lab.read(RESULTS / f"{algo}-{seed}.csv")) == N_ROUNDS + 1]
         for number, rows in enumerate(zip(*runs, strict=True)):
             columns = [("human_steps", 0), ("total_steps", 0), ("success_rate", 2), ("cost_mean", 2), ("return_mean", 0)]
             cells = [text(list(rows), *column) for column in columns]
@@ -228,7 +199,7 @@ def report(args: argparse.Namespace) -> None:
         "\n| GAIL on | seeds | demonstrated steps | expert | untrained | at the end | steps |\n|---|---|---|---|---|---|---|"
     )
     for env_id in args.envs:
-        runs = [run for seed in args.seeds if len(run := read(RESULTS / f"gail-{env_id}-{seed}.csv")) == 11]
+        runs = [run for seed in args.seeds if len(run := lab.read(RESULTS / f"gail-{env_id}-{seed}.csv")) == 11]
         if runs:
             first, last = [run[0] for run in runs], [run[-1] for run in runs]
             print(

@@ -10,16 +10,14 @@ cut off starts anew. Seeds 0-2 are the reported ones; tuning is done on seeds fr
 """
 
 import argparse
-import csv
-import importlib.metadata
-import multiprocessing
 import time
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import gymnasium as gym
+import lab
 import numpy as np
+import tables
 import torch as th
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -33,9 +31,7 @@ RESULTS = Path(__file__).parent / "results" / "lagrangian"
 ENV = "HalfCheetah-v5"
 FASTEST, LIMIT = 3.2096, 25.0  # [m/s], steps an episode
 PARTS, EVALUATION_EPISODES = 10, 5
-VERSIONS = " ".join(
-    f"{name}={importlib.metadata.version(name)}" for name in ("torch", "stable-baselines3", "gymnasium", "mujoco", "numpy")
-)
+VERSIONS = lab.versions("torch", "stable-baselines3", "gymnasium", "mujoco", "numpy")
 
 
 class Speeding(gym.Wrapper):
@@ -146,11 +142,7 @@ def run(name: str, seed: int, folder: Path) -> str:
             "cpu_seconds": round(time.process_time()),
             "versions": VERSIONS,
         }
-        with path.open("a", newline="") as file:
-            writer = csv.DictWriter(file, row)
-            if file.tell() == 0:
-                writer.writeheader()
-            writer.writerow(row)
+        lab.append(path, row)
     return f"{name} seed {seed}: {time.process_time():.0f} CPU seconds"
 
 
@@ -158,24 +150,18 @@ def read(path: Path) -> list[dict[str, str]]:
     """
     :return: the rows of a run that is complete, else none
     """
-    if not path.exists():
-        return []
-    with path.open(newline="") as file:
-        rows = list(csv.DictReader(file))
+    rows = lab.read(path)
     return rows if len(rows) == PARTS else []
 
 
 def run_all(args: argparse.Namespace) -> None:
-    jobs = [
-        (name, seed, args.folder)
+    missing = [
+        (run, name, seed, args.folder)
         for seed in args.seeds
         for name in args.methods
         if not read(args.folder / f"{name}-{seed}.csv")
     ]  # fmt: skip
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(args.jobs, mp_context=context, max_tasks_per_child=1) as pool:
-        for done, future in enumerate(as_completed([pool.submit(run, *job) for job in jobs]), 1):
-            print(f"[{done}/{len(jobs)}] {future.result()}", flush=True)
+    lab.run_all(missing, args.jobs)
 
 
 def report(args: argparse.Namespace) -> None:
@@ -186,21 +172,16 @@ def report(args: argparse.Namespace) -> None:
     from matplotlib import pyplot as plt
 
     figure, axes = plt.subplots(1, 2, figsize=(8.4, 3.2))
-    print("| method | seeds | steps | return | cost | deterministic: return | cost |\n|---|---|---|---|---|---|---|")
+    print(tables.lagrangian())
     for name in args.methods:
         runs = [rows for seed in args.seeds if (rows := read(args.folder / f"{name}-{seed}.csv"))]
         if not runs:
             continue
-        cells = []
-        for key in ("return", "cost", "evaluation_return", "evaluation_cost"):
+        for key in ("return", "cost"):
             curves = np.array([[float(row[key]) for row in rows] for rows in runs])
-            last = curves[:, -3:].mean(axis=1)
-            cells.append(f"{last.mean():.0f}" + (f" ± {last.std(ddof=1):.0f}" if len(last) > 1 else ""))
-            if key in ("return", "cost"):
-                axis, share = axes[int(key == "cost")], np.arange(1, PARTS + 1) / PARTS
-                (line,) = axis.plot(share, curves.mean(axis=0), label=name.upper().replace("_LAG", "-Lag"))
-                axis.fill_between(share, curves.min(axis=0), curves.max(axis=0), color=line.get_color(), alpha=0.15)
-        print(f"| {name} | {len(runs)} | {METHODS[name].steps:,} | " + " | ".join(cells) + " |")
+            axis, share = axes[int(key == "cost")], np.arange(1, PARTS + 1) / PARTS
+            (line,) = axis.plot(share, curves.mean(axis=0), label=name.upper().replace("_LAG", "-Lag"))
+            axis.fill_between(share, curves.min(axis=0), curves.max(axis=0), color=line.get_color(), alpha=0.15)
     axes[0].set(xlabel="share of the training", ylabel="return of an episode")
     axes[1].set(xlabel="share of the training", ylabel="cost of an episode")
     axes[1].axhline(LIMIT, color="black", linewidth=0.8, linestyle="--")

@@ -12,15 +12,14 @@ cut off starts anew. Seeds 0-2 are the reported ones; tune on seeds from 100.
 
 import argparse
 import csv
-import importlib.metadata
-import multiprocessing
 import time
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 
+import lab
 import numpy as np
 import rl_zoo3
 import sb3_contrib.tqc.tqc as tqc
+import tables
 import torch as th
 import yaml
 from stable_baselines3 import SAC
@@ -63,8 +62,7 @@ class Evaluate(BaseCallback):
     def __init__(self, file, labels: list, eval_env):
         super().__init__()
         self.file, self.labels, self.eval_env = file, labels, eval_env
-        versions = " ".join(f"{name}={importlib.metadata.version(name)}" for name in PACKAGES)
-        self.versions = versions
+        self.versions = lab.versions(*PACKAGES)
         csv.writer(file).writerow(["algo", "env", "seed", "step", "return_mean", "return_std", "cpu_seconds", "versions"])
 
     def _on_step(self) -> bool:
@@ -97,13 +95,8 @@ def run(algo: str, env_id: str, seed: int, folder: Path, overrides: dict | None 
     return f"{algo} {env_id} seed {seed}: {time.process_time():.0f} CPU seconds"
 
 
-def read(path: Path) -> list[dict[str, str]]:
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
-
-
 def is_finished(path: Path, budget: int) -> bool:
-    rows = read(path) if path.is_file() else []
+    rows = lab.read(path)
     return bool(rows) and int(rows[-1]["step"] or 0) >= budget
 
 
@@ -115,14 +108,7 @@ def run_all(args: argparse.Namespace) -> None:
         for algo in args.algos
         if not is_finished(args.folder / env_id / f"{algo}-{seed}.csv", BUDGETS[env_id][0])
     ]
-    print(f"{len(jobs)} runs to do")
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(args.jobs, mp_context=context, max_tasks_per_child=1) as pool:
-        futures = {pool.submit(run, *job, args.folder): job for job in jobs}
-        for done, future in enumerate(as_completed(futures), 1):
-            error = future.exception()
-            outcome = f"{futures[future]} failed: {error!r}" if error else future.result()
-            print(f"[{done}/{len(jobs)}] {outcome}", flush=True)
+    lab.run_all([(run, *job, args.folder) for job in jobs], args.jobs)
 
 
 def report(args: argparse.Namespace) -> None:
@@ -133,19 +119,15 @@ def report(args: argparse.Namespace) -> None:
     from matplotlib import pyplot as plt
 
     figure, axes = plt.subplots(1, len(args.envs), figsize=(4.2 * len(args.envs), 3.2), squeeze=False)
-    print("| environment | algorithm | seeds | return, last 3 evaluations (mean ± std over seeds) | mean of the whole curve |")
-    print("|---|---|---|---|---|")
+    print(tables.learning())
     for env_id, axis in zip(args.envs, axes[0], strict=True):
         for algo in args.algos:
             paths = [args.folder / env_id / f"{algo}-{seed}.csv" for seed in args.seeds]
-            runs = [read(path) for path in paths if is_finished(path, BUDGETS[env_id][0])]
+            runs = [lab.read(path) for path in paths if is_finished(path, BUDGETS[env_id][0])]
             if not runs:
                 continue
             steps = [int(row["step"]) for row in runs[0]]
             curves = np.array([[float(row["return_mean"]) for row in rows] for rows in runs])
-            final = curves[:, -3:].mean(axis=1)
-            spread = f" ± {final.std(ddof=1):.0f}" if len(final) > 1 else ""
-            print(f"| {env_id} | {algo} | {len(runs)} | {final.mean():.0f}{spread} | {curves.mean():.0f} |")
             (line,) = axis.plot(steps, curves.mean(axis=0), label=algo.upper())
             axis.fill_between(steps, curves.min(axis=0), curves.max(axis=0), color=line.get_color(), alpha=0.15)
         axis.set(title=env_id, xlabel="environment steps", ylabel="evaluation return")

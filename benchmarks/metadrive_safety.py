@@ -10,14 +10,11 @@ tuning; that was done on maps 3000-3199.
 """
 
 import argparse
-import csv
-import importlib.metadata
-import multiprocessing
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from itertools import product
 from pathlib import Path
 
 import gymnasium as gym
+import lab
 import numpy as np
 import torch as th
 
@@ -26,10 +23,7 @@ from sb3_chac import InterventionWrapper
 from sb3_chac.envs.metadrive import PRESETS
 
 DRIVERS_CSV = Path(__file__).parent / "results" / "metadrive" / "drivers.csv"
-VERSIONS = " ".join(
-    f"{name}={importlib.metadata.version(name)}"
-    for name in ("metadrive-simulator", "panda3d", "numpy", "torch", "stable-baselines3", "gymnasium")
-)
+VERSIONS = lab.versions("metadrive-simulator", "panda3d", "numpy", "torch", "stable-baselines3", "gymnasium")
 DRIVERS = ("scripted", "scripted-ideal", "idm", "ppo")
 DRIVER_MAPS = range(1000, 1100)
 CHUNK = 5  # episodes after which a process writes its rows
@@ -41,22 +35,6 @@ COLUMNS = {  # -> digits in the report
     "steps": 0,
     "route_completion": 3,
 }
-
-
-def read() -> list[dict[str, str]]:
-    if not DRIVERS_CSV.exists():
-        return []
-    with DRIVERS_CSV.open(newline="") as file:
-        return list(csv.DictReader(file))
-
-
-def append(rows: list[dict]) -> None:
-    DRIVERS_CSV.parent.mkdir(parents=True, exist_ok=True)
-    with DRIVERS_CSV.open("a", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]))
-        if file.tell() == 0:
-            writer.writeheader()
-        writer.writerows(rows)
 
 
 def drive(env, driver, scenario: int) -> dict:
@@ -91,15 +69,13 @@ def drive_some(preset: str, name: str, scenarios: list[int]) -> list[dict]:
 
 
 def drivers(args: argparse.Namespace) -> None:
-    there = {(row["preset"], row["driver"], int(row["scenario"])) for row in read()}
+    there = {(row["preset"], row["driver"], int(row["scenario"])) for row in lab.read(DRIVERS_CSV)}
     tasks = []
     for name, preset in product(args.drivers, PRESETS):
         missing = [scenario for scenario in DRIVER_MAPS if (preset, name, scenario) not in there]
         tasks += [(preset, name, missing[i : i + CHUNK]) for i in range(0, len(missing), CHUNK)]
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(args.jobs, mp_context=context) as pool:  # MetaDrive has one engine per process
-        for future in as_completed([pool.submit(drive_some, *task) for task in tasks]):
-            append(future.result())
+    for rows in lab.outcomes([(drive_some, *task) for task in tasks], args.jobs):  # MetaDrive has one engine per process
+        lab.append(DRIVERS_CSV, *rows)
     report(args)
 
 
@@ -125,7 +101,7 @@ def observations(args: argparse.Namespace) -> None:
 
 
 def report(args: argparse.Namespace) -> None:
-    rows = read()
+    rows = lab.read(DRIVERS_CSV)
     print("| preset | driver | episodes | " + " | ".join(name.replace("_", " ") for name in COLUMNS) + " |")
     print("|---|---|---" + "|---" * len(COLUMNS) + "|")
     for preset, name in product(PRESETS, DRIVERS):

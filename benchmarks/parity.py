@@ -12,13 +12,12 @@ benchmarks/results/parity/parity.csv; the datasets are committed beside it.
 """
 
 import argparse
-import csv
-import importlib.metadata
 import time
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import lab
 import numpy as np
 
 RESULTS = Path(__file__).parent / "results" / "parity"
@@ -73,14 +72,10 @@ def save(library: str, algo: str, seed: int, score: float, start: float) -> None
         "seed": seed,
         "return": round(score, 1),
         "cpu_seconds": round(time.process_time() - start),
-        "versions": " ".join(f"{name}={importlib.metadata.version(name)}" for name in packages),
+        "versions": lab.versions(*packages),
     }
     print(row, flush=True)
-    with (RESULTS / "parity.csv").open("a", newline="") as file:
-        writer = csv.DictWriter(file, list(row))
-        if file.tell() == 0:
-            writer.writeheader()
-        writer.writerow(row)
+    lab.append(RESULTS / "parity.csv", row)
 
 
 def ours(algo: str, seed: int, columns: dict[str, np.ndarray]) -> float:
@@ -158,8 +153,7 @@ def d3rlpy(algo: str, seed: int, columns: dict[str, np.ndarray]) -> float:
 
 
 def report() -> None:
-    with (RESULTS / "parity.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
+    rows = lab.read(RESULTS / "parity.csv")
     print("| algorithm | dataset (mean return of an episode) | steps | ours | d3rlpy 2.8.1 |")
     print("|---" * 5 + "|")
     for algo, steps in sorted({(row["algo"], int(row["steps"])) for row in rows}):

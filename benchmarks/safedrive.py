@@ -13,14 +13,12 @@ CSVs are written to benchmarks/results/safedrive/. Maps: 100-119 to learn on, 10
 
 import argparse
 import csv
-import importlib.metadata
-import multiprocessing
 import resource
 import time
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 
 import gymnasium as gym
+import lab
 import numpy as np
 import torch as th
 from stable_baselines3 import SAC
@@ -35,21 +33,10 @@ from sb3_chac.evaluation.evaluation import evaluate
 from sb3_chac.human import InterventionWrapper
 
 RESULTS = Path(__file__).parent / "results" / "safedrive"
-VERSIONS = " ".join(
-    f"{name}={importlib.metadata.version(name)}"
-    for name in ("torch", "stable-baselines3", "gymnasium", "highway-env", "numpy")
-)
+VERSIONS = lab.versions("torch", "stable-baselines3", "gymnasium", "highway-env", "numpy")
 DRIVER_MAPS = range(400_000, 400_200)
 TEST_MAPS = range(1000, 1050)
 LEARN_STEPS, LEARN_EVERY = 100_000, 10_000
-
-
-def write(name: str, rows: list[dict]) -> None:
-    RESULTS.mkdir(parents=True, exist_ok=True)
-    with (RESULTS / name).open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
 
 
 class BlindFollower:
@@ -122,7 +109,7 @@ def drivers(args: argparse.Namespace) -> None:
         rows += results
         keys = ("return", "cost", "success", "out_of_road", "route_completion", "steps")
         print(name, {key: round(float(np.mean([row[key] for row in results])), 3) for key in keys}, flush=True)
-    write("drivers.csv", rows)
+    lab.write(RESULTS / "drivers.csv", rows)
 
 
 def reference_loop(n: int) -> float:
@@ -175,7 +162,7 @@ def speed(args: argparse.Namespace) -> None:
         f"{np.mean(rates):.0f} steps per CPU second (least {min(rates):.0f}); a step costs {per_reference:.1f} reference loops"
         f"; the corridors take {np.mean([row['corridors_us'] for row in rows]):.0f} us"
     )
-    write("speed.csv", rows)
+    lab.write(RESULTS / "speed.csv", rows)
 
     rows = []
     for episode in range(1000):
@@ -187,7 +174,7 @@ def speed(args: argparse.Namespace) -> None:
             current = int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize() / 2**20
             rows.append({"episodes": episode + 1, "resident_mib": round(current, 1), "peak_mib": round(peak / 1024, 1)})
     print(f"memory after 50 episodes {rows[0]['resident_mib']} MiB, after 1000 {rows[-1]['resident_mib']} MiB")
-    write("memory.csv", rows)
+    lab.write(RESULTS / "memory.csv", rows)
 
 
 def traffic(args: argparse.Namespace) -> None:
@@ -215,7 +202,7 @@ def traffic(args: argparse.Namespace) -> None:
             rows.append({**row, "most_cars": most, "longest_standing_s": round(longest, 1), "steps": env.steps})
         here = rows[-100:]
         print(density, {k: sum(row[k] for row in here) for k in ("overlaps", "towed")}, "in 100 episodes", flush=True)
-    write("traffic.csv", rows)
+    lab.write(RESULTS / "traffic.csv", rows)
 
 
 def takeovers(args: argparse.Namespace) -> None:
@@ -252,7 +239,7 @@ def takeovers(args: argparse.Namespace) -> None:
             }
             share = sum(row["human_steps"] for row in here) / sum(row["steps"] for row in here)
             print(f"{name:15s}{'armed' if armed else 'alone'}  takeover share {share:.3f}", mean, flush=True)
-    write("takeovers.csv", rows)
+    lab.write(RESULTS / "takeovers.csv", rows)
 
 
 class Evaluate(BaseCallback):
@@ -285,21 +272,10 @@ def learn_one(seed: int, steps: int, path: Path) -> str:
     return f"sac seed {seed}: {time.process_time():.0f} CPU seconds"
 
 
-def read(path: Path) -> list[dict[str, str]]:
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
-
-
 def learn(args: argparse.Namespace) -> None:
     paths = {seed: RESULTS / f"sac-{seed}.csv" for seed in args.seeds}
-    missing = [
-        s for s, path in paths.items() if not path.exists() or not read(path) or int(read(path)[-1]["step"]) < args.steps
-    ]
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(args.jobs, mp_context=context, max_tasks_per_child=1) as pool:
-        futures = [pool.submit(learn_one, seed, args.steps, paths[seed]) for seed in missing]
-        for future in as_completed(futures):
-            print(future.result(), flush=True)
+    missing = [s for s, path in paths.items() if not lab.read(path) or int(lab.read(path)[-1]["step"]) < args.steps]
+    lab.run_all([(learn_one, seed, args.steps, paths[seed]) for seed in missing], args.jobs)
 
 
 def report(args: argparse.Namespace) -> None:
@@ -309,7 +285,7 @@ def report(args: argparse.Namespace) -> None:
     matplotlib.use("Agg")
     from matplotlib import pyplot as plt
 
-    runs = [read(path) for path in sorted(RESULTS.glob("sac-[012].csv"))]
+    runs = [lab.read(path) for path in sorted(RESULTS.glob("sac-[012].csv"))]
     steps = [int(row["step"]) for row in runs[0]]
     names = {"success_rate": "success rate", "cost_mean": "safety cost", "return_mean": "return"}
     figure, axes = plt.subplots(1, 3, figsize=(12, 3.2))

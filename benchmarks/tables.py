@@ -18,7 +18,8 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from guidance_curves import COLUMNS, load_run, read
+from guidance_curves import COLUMNS, load_run
+from lab import read
 
 from sb3_chac.evaluation import curves
 from sb3_chac.evaluation.curves import Curves, Method
