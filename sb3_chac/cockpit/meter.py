@@ -1,4 +1,4 @@
-"""The guidance meter: how much what the novice is about to do needs a person, as the proxy value tells it."""
+"""The guidance meter: how much what the novice is about to do needs a person, as the critics tell it."""
 
 from collections import deque
 
@@ -9,8 +9,8 @@ CALM = 10  # steps below the threshold after which help is no longer asked for
 
 class GuidanceMeter:
     """
-    Turns proxy values into a risk from 0 to 1: the share of the last ``memory`` values that were higher. Proxy values have no
-    scale of their own (they depend on how often a person took over, and for what), their order is what they tell.
+    Turns values of a critic into a risk from 0 to 1: the share of the last ``memory`` values that were higher. They have no
+    scale of their own (it depends on how often a person took over, and for what), their order is what they tell.
 
     With a threshold it asks for help as soon as the risk reaches it, until ``CALM`` steps in a row were below.
 
@@ -28,7 +28,7 @@ class GuidanceMeter:
         """
         Take the next value.
 
-        :param value: proxy value of the novice's action, None if there is none yet
+        :param value: of the novice's action, None if there is none yet
         :return: risk, None as long as there are fewer than ``LEAST`` values to compare with
         """
         risk = None

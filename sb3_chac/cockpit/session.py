@@ -25,7 +25,7 @@ class Novice:
     :param stage: of the training, to read
     :param self_drives: C-HAC in stage 2: whether the self-learning policy acts
     :param confidence: C-HAC in stage 2: P(Q_r > Q_g)
-    :param risk: rank of the proxy value of what it is about to do, see ``GuidanceMeter``
+    :param risk: rank of the value of what it is about to do, see ``GuidanceMeter``
     :param asks: whether it asks for help
     """
 
