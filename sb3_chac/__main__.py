@@ -9,7 +9,8 @@ from importlib import import_module
 
 # Name -> module
 OWN_COMMANDS = {
-    name: f"sb3_chac.cli.{name}" for name in ("drive", "evaluate", "resume", "plot", "compare", "demos", "export", "run")
+    name: f"sb3_chac.cli.{name}"
+    for name in ("drive", "evaluate", "resume", "plot", "compare", "demos", "export", "run", "vehicle")
 }
 COMMANDS = ("train", "enjoy", "plot_train", "plot_from_file", "all_plots", *OWN_COMMANDS)
 
@@ -24,6 +25,7 @@ RL-Zoo3's commands with the algorithms of sb3_chac, and
   demos COMMAND         demonstrations: record them, look at them, drive them again
   export MODEL.zip POLICY.onnx  a model as one ONNX file, for a vehicle
   run POLICY.onnx       that file at the end of a network link: observations in, checked actions out; without torch
+  vehicle               an environment as a vehicle at the end of a link, for a learner elsewhere (RemoteVehicle-v0)
 With --gym-packages MODULE [MODULE ...], each imports these first: they register environments of yours.
 'sb3-chac train --help' lists the arguments, so does --help of the others.
 Models, replay buffers, run folders and hyperparameters files are code (docs/loading.md): open those that you trust only."""

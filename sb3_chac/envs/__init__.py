@@ -13,9 +13,12 @@ VALIDATION = {name: {"start_scenario": 2000, "num_scenarios": 50} for name in EN
 # Of which a process can have one only
 ONE_PER_PROCESS = {"MetaDriveSafety-v0"}
 
-for _name, _entry_point in ENVIRONMENTS.items():
+# For rehearsals (no maps for validation)
+REHEARSALS = {
+    "RoadTest-v0": "sb3_chac.envs.roadtest:RoadTestEnv",
+    "RemoteVehicle-v0": "sb3_chac.deploy.remote:RemoteVehicle",
+}
+
+for _name, _entry_point in (ENVIRONMENTS | REHEARSALS).items():
     if _name not in registry:
         register(_name, entry_point=_entry_point)
-# For rehearsals (no maps for validation, no hyperparameters of its own)
-if "RoadTest-v0" not in registry:
-    register("RoadTest-v0", entry_point="sb3_chac.envs.roadtest:RoadTestEnv")

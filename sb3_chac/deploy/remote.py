@@ -1,0 +1,291 @@
+"""A vehicle in a process of its own, or on another machine, that a learner trains over UDP: its two ends."""
+
+import json
+import math
+import select
+import socket
+import struct
+import time
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+
+from sb3_chac.common import contract
+from sb3_chac.deploy.link import Channel
+from sb3_chac.deploy.metadata import NotDeployable
+
+MAGIC = b"SB3R"
+HEADER = struct.Struct("!4s16sQBI")  # magic, session of the learner, number of the request, kind, length of the JSON text
+SPACES, RESET, STEP = range(3)
+LARGEST = 65_000  # [bytes] of a packet
+RESEND = 0.05  # [s] without an answer after which a request is sent again
+PATIENCE = 10.0  # [s] without an answer after which the vehicle is given up
+
+
+class LateLink(gym.Wrapper):
+    """
+    The vehicle's end of a bad link, on the environment's own clock: actions come late or never, and sensors are noisy.
+
+    An action that arrives within the first half of a step is executed in it, later ones in the step after. Where none has come
+    in time, the last one goes on. It belongs outside of the takeover: a person in the vehicle acts at once.
+
+    :param env: with bounded actions and observations in a Box
+    :param latency: [s] least delay of an action
+    :param jitter: [s] that the greatest delay is longer
+    :param loss: share of the actions that are lost
+    :param noise: standard deviation of what is added to observations, in their units; they stay in their space
+    :param seed: of the link
+    :raises NotDeployable: for values out of their range
+    """
+
+    def __init__(
+        self, env: gym.Env, latency: float = 0.0, jitter: float = 0.0, loss: float = 0.0, noise: float = 0.0, seed: int = 0
+    ) -> None:
+        super().__init__(env)
+        if not (math.isfinite(noise) and noise >= 0):
+            raise NotDeployable(f"noise must be a finite number of at least 0, got {noise!r}.")
+        self.rng = np.random.default_rng(seed)
+        self.period = 1 / float(env.metadata.get("render_fps") or 10)
+        self.settings = latency, jitter, loss
+        self.noise = noise
+        Channel(self.rng, *self.settings)
+
+    def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
+        self.channel, self.steps, self.newest = Channel(self.rng, *self.settings), 0, -1
+        self.action = np.zeros(self.action_space.shape or (), self.action_space.dtype)
+        observation, info = self.env.reset(**kwargs)
+        return self._sensed(observation), info
+
+    def step(self, action: np.ndarray) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        now = self.steps * self.period
+        self.channel.put((self.steps, np.array(action)), now)
+        for number, arrived in self.channel.ready(now + self.period / 2):
+            if number > self.newest:
+                self.newest, self.action = number, arrived
+        self.steps += 1
+        observation, *rest = self.env.step(self.action)
+        return self._sensed(observation), *rest  # type: ignore[return-value]
+
+    def _sensed(self, observation: np.ndarray) -> np.ndarray:
+        if self.noise == 0:
+            return observation
+        space = self.observation_space
+        assert isinstance(space, spaces.Box)
+        noisy = observation + self.rng.normal(0, self.noise, observation.shape)
+        return np.clip(noisy, space.low, space.high).astype(space.dtype)
+
+
+class VehicleServer:
+    """
+    The vehicle's end: resets and steps an environment as a learner asks. A request that comes twice is answered twice and done
+    once.
+
+    :param env: observations and actions are Boxes; takeovers happen in it
+    :param sock: bound UDP socket
+    :raises NotDeployable: for other spaces
+    """
+
+    def __init__(self, env: gym.Env, sock: socket.socket) -> None:
+        for name in ("observation_space", "action_space"):
+            if not isinstance(getattr(env, name), spaces.Box):
+                raise NotDeployable(f"{name} must be a Box, got {getattr(env, name)}.")
+        self.env, self.sock = env, sock
+        self.steps = self.episodes = 0
+        self._last: tuple[bytes, int, bytes] = b"", -1, b""  # session, number and answer
+
+    def serve(self, steps: int | None = None) -> None:
+        """
+        Answer until ``steps`` were made.
+
+        :param steps: of the environment, None to go on for ever
+        """
+        while steps is None or self.steps < steps:
+            self.answer(*self.sock.recvfrom(LARGEST))
+
+    def answer(self, data: bytes, sender: Any) -> None:
+        """
+        Answer one packet; what is no request is left alone.
+
+        :param data: that came
+        :param sender: its address
+        """
+        try:
+            session, number, kind, meta, body = unpack(data)
+        except ValueError:
+            return
+        last_session, last_number, last_answer = self._last
+        if session == last_session and number <= last_number:
+            if number == last_number:
+                self.sock.sendto(last_answer, sender)
+            return
+        try:
+            answer = pack(session, number, kind, *self._do(kind, meta, body))
+        except (ValueError, KeyError, TypeError, gym.error.Error) as error:
+            answer = pack(session, number, kind, {"error": str(error)})
+        self._last = session, number, answer
+        self.sock.sendto(answer, sender)
+
+    def _do(self, kind: int, meta: dict[str, Any], body: bytes) -> tuple[dict[str, Any], bytes]:
+        env = self.env
+        if kind == SPACES:
+            found = {name: space_of(getattr(env, name)) for name in ("observation_space", "action_space")}
+            return {**found, "render_fps": env.metadata.get("render_fps"), "env": env.spec.id if env.spec else str(env)}, b""
+        if kind == RESET:
+            self.episodes += 1
+            observation, info = env.reset(seed=meta["seed"], options=meta["options"])
+            return {"info": reported(info)}, observation.astype(np.float32).tobytes()
+        assert isinstance(env.action_space, spaces.Box)
+        action = np.frombuffer(body, np.float32).reshape(env.action_space.shape)
+        if not np.isfinite(action).all():
+            raise ValueError(f"the action is {action}")
+        observation, reward, terminated, truncated, info = env.step(action.astype(env.action_space.dtype))
+        self.steps += 1
+        ends = {"reward": float(reward), "terminated": bool(terminated), "truncated": bool(truncated)}
+        return {**ends, "info": reported(info)}, observation.astype(np.float32).tobytes()
+
+
+class RemoteVehicle(gym.Env):
+    """
+    The learner's end: an environment whose steps a vehicle makes ('sb3-chac vehicle'), as ``RemoteVehicle-v0``.
+
+    Takeovers happen in the vehicle, and come in ``info`` as HIL-SERL's do: ``intervene_action`` is what the person did, None
+    else, and ``is_intervention`` tells. Lost packets are sent again, so that no step is made twice or lost; how late and noisy
+    the vehicle's own link is, it says itself (``LateLink``).
+
+    :param address: HOST:PORT of the vehicle
+    :param patience: [s] without an answer after which the vehicle is given up
+    :raises NotDeployable: for an address that is none, or if no vehicle answers
+    """
+
+    metadata = {"render_modes": []}  # noqa: RUF012
+
+    def __init__(self, address: str = "127.0.0.1:5700", patience: float = PATIENCE) -> None:
+        host, _, port = str(address).rpartition(":")
+        if not host or not port.isdigit() or not 0 < int(port) < 65536:
+            raise NotDeployable(f"address must be HOST:PORT, such as 127.0.0.1:5700, got {address!r}.")
+        if not (math.isfinite(patience) and patience > 0):
+            raise NotDeployable(f"patience must be a finite number of seconds above 0, got {patience!r}.")
+        self.address, self.patience = (host, int(port)), patience
+        self.sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.sock.connect(self.address)
+        self.sock.setblocking(False)
+        self.session, self.number = np.random.default_rng().bytes(16), 0
+        try:
+            meta, _ = self._ask(SPACES, {})
+        except NotDeployable:
+            self.sock.close()
+            raise
+        self.observation_space, self.action_space = (
+            spaces.Box(np.float32(low), np.float32(high), tuple(shape), np.float32)
+            for low, high, shape in (meta["observation_space"], meta["action_space"])
+        )
+        self.metadata = {**self.metadata, "render_fps": meta["render_fps"], "vehicle": meta["env"]}
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
+        super().reset(seed=seed)
+        meta, body = self._ask(RESET, {"seed": seed, "options": options})
+        return self._observation(body), meta["info"]
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        meta, body = self._ask(STEP, {}, np.asarray(action, np.float32).tobytes())
+        return self._observation(body), meta["reward"], meta["terminated"], meta["truncated"], meta["info"]
+
+    def _observation(self, body: bytes) -> np.ndarray:
+        return np.frombuffer(body, np.float32).reshape(self.observation_space.shape or ()).copy()
+
+    def _ask(self, kind: int, meta: dict[str, Any], body: bytes = b"") -> tuple[dict[str, Any], bytes]:
+        """
+        Send a request until it is answered.
+
+        :raises NotDeployable: if nobody answers, or the vehicle says that it cannot
+        """
+        self.number += 1
+        request = pack(self.session, self.number, kind, meta, body)
+        end = time.monotonic() + self.patience
+        while time.monotonic() < end:
+            try:
+                self.sock.send(request)
+                while select.select([self.sock], [], [], RESEND)[0]:
+                    session, number, _, answer, rest = unpack(self.sock.recv(LARGEST))
+                    if (session, number) != (self.session, self.number):
+                        continue
+                    if "error" in answer:
+                        raise NotDeployable(f"the vehicle at {self.address[0]}:{self.address[1]} refuses: {answer['error']}")
+                    return answer, rest
+            except ConnectionRefusedError:  # nobody listens there yet
+                time.sleep(RESEND)
+            except ValueError as error:
+                if isinstance(error, NotDeployable):
+                    raise
+        host, port = self.address
+        raise NotDeployable(
+            f"no vehicle answers at {host}:{port} for {self.patience:g} s: start one, 'sb3-chac vehicle --listen HOST:PORT'."
+        )
+
+    def close(self) -> None:
+        """Close the socket."""
+        self.sock.close()
+
+
+def pack(session: bytes, number: int, kind: int, meta: dict[str, Any], body: bytes = b"") -> bytes:
+    """
+    Make a packet.
+
+    :param session: 16 bytes, of the learner
+    :param number: of the request
+    :param kind: SPACES, RESET or STEP
+    :param meta: what JSON can hold
+    :param body: numbers, float32
+    """
+    text = json.dumps(meta, allow_nan=False).encode()
+    return HEADER.pack(MAGIC, session, number, kind, len(text)) + text + body
+
+
+def unpack(data: bytes) -> tuple[bytes, int, int, dict[str, Any], bytes]:
+    """
+    Read a packet.
+
+    :return: session, number, kind, meta and body, see ``pack``
+    :raises ValueError: if it is none
+    """
+    if len(data) < HEADER.size:
+        raise ValueError("too short")
+    magic, session, number, kind, length = HEADER.unpack_from(data)
+    if magic != MAGIC or kind not in (SPACES, RESET, STEP):
+        raise ValueError("not a packet of ours")
+    meta = json.loads(data[HEADER.size : HEADER.size + length])
+    if not isinstance(meta, dict):
+        raise ValueError("not a packet of ours")
+    return session, number, kind, meta, data[HEADER.size + length :]
+
+
+def space_of(space: spaces.Box) -> tuple[float | list[Any], float | list[Any], list[int]]:
+    """
+    Describe a space for the link.
+
+    :return: low and high, each a number if all are equal, and the shape
+    """
+    bounds = [b.flat[0].item() if np.all(b == b.flat[0]) else b.tolist() for b in (space.low, space.high)]
+    return *bounds, list(space.shape)  # type: ignore[return-value]
+
+
+def reported(info: dict[str, Any]) -> dict[str, Any]:
+    """
+    Choose what a vehicle reports of ``info``.
+
+    :param info: of an environment in an ``InterventionWrapper``, or without one
+    :return: its numbers and texts, and the takeover as other projects report theirs
+    """
+    found: dict[str, Any] = {}
+    for key, value in info.items():
+        value = value.item() if isinstance(value, np.generic) else value
+        if isinstance(value, bool | int | str) or (isinstance(value, float) and math.isfinite(value)):
+            found[key] = value
+    if contract.TAKEOVER in info:
+        takeover = bool(found.pop(contract.TAKEOVER))
+        found.pop(contract.TAKEOVER_START, None)
+        action = np.asarray(info[contract.APPLIED_ACTION], float).tolist() if takeover else None
+        found |= {"is_intervention": takeover, "intervene_action": action}
+    return found
