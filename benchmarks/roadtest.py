@@ -1,4 +1,4 @@
-"""The paper's road test, rehearsed: a vehicle in a process of its own, trained on route 1 over a bad link, tested on both routes.
+"""The paper's road test, rehearsed: a vehicle in its own process, trained on route 1 over a bad link, tested on both.
 
     python benchmarks/roadtest.py train             # D-PVP: 'sb3-chac vehicle' and the learner, two processes
     python benchmarks/roadtest.py test              # ten episodes on each route, without the person
@@ -107,7 +107,8 @@ def test(args: argparse.Namespace) -> None:
                 done, n = terminated or truncated, n + 1
                 values = (info["route_completion"], *env.action, info["speed"])
                 names = ("completion", "steering", "acceleration", "speed")
-                steps.append({"route": route, "episode": episode, "step": n} | {k: f"{v:.3f}" for k, v in zip(names, values)})
+                numbers = {name: f"{value:.3f}" for name, value in zip(names, values, strict=True)}
+                steps.append({"route": route, "episode": episode, "step": n} | numbers)
             row = {"algo": args.algo, "seed": args.seed, "trained_steps": model.num_timesteps, "route": route}
             row |= {"episode": episode, "completed": int(info["is_success"]), "collisions": int(info["episode_cost"])}
             episodes.append(row | {"route_completion": round(info["route_completion"], 3), "steps": n, "versions": VERSIONS})
