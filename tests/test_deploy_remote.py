@@ -194,6 +194,23 @@ def test_what_the_vehicle_refuses_is_said_and_changes_nothing(vehicle):
     env.close()
 
 
+def test_a_vehicle_has_one_learner_at_a_time(vehicle):
+    cart = Cart()
+    _, address = vehicle(cart)
+    first, second = RemoteVehicle(address), RemoteVehicle(address)
+    with pytest.raises(NotDeployable, match="another learner"):
+        first.step(np.zeros(2, np.float32))
+    first.reset()
+    first.step(np.zeros(2, np.float32))
+    second.reset()
+    with pytest.raises(NotDeployable, match=r"another learner has reset the vehicle.*--eval-freq -1"):
+        first.step(np.zeros(2, np.float32))
+    assert len(cart.actions) == 1
+    second.step(np.zeros(2, np.float32))
+    first.close()
+    second.close()
+
+
 def test_packets_of_others_are_left_alone():
     answers = []
 

@@ -19,7 +19,7 @@ DESCRIPTION = """Be the vehicle: make the steps of an environment as a learner a
 takes over. The learner trains in RemoteVehicle-v0, in another process or on another machine:
 
   sb3-chac vehicle --env RoadTest-v0 --listen 127.0.0.1:5700 --latency 0.02 --jitter 0.06 --loss 0.05 --noise 0.01
-  rl_zoo3 train --algo dpvp --env RemoteVehicle-v0 --env-kwargs "address:'127.0.0.1:5700'"
+  rl_zoo3 train --algo dpvp --env RemoteVehicle-v0 --env-kwargs "address:'127.0.0.1:5700'" --eval-freq -1
 
 Time is the environment's: as fast as both ends can. Packets are neither encrypted nor authenticated: use a network that nobody
 else is on."""

@@ -21,6 +21,7 @@ HEADER = struct.Struct("!4s16sQBI")  # magic, session of the learner, number of 
 SPACES, RESET, STEP = range(3)
 LARGEST = 65_000  # [bytes] of a packet
 RESEND = 0.05  # [s] without an answer after which a request is sent again
+MOST_LEARNERS = 8  # whose last answers are kept
 PATIENCE = 10.0  # [s] without an answer after which the vehicle is given up
 
 
@@ -93,7 +94,8 @@ class VehicleServer:
                 raise NotDeployable(f"{name} must be a Box, got {getattr(env, name)}.")
         self.env, self.sock = env, sock
         self.steps = self.episodes = 0
-        self._last: tuple[bytes, int, bytes] = b"", -1, b""  # session, number and answer
+        self._last: dict[bytes, tuple[int, bytes]] = {}  # session -> number and answer of its last request
+        self._drives = b""  # session that has reset the vehicle last
 
     def serve(self, steps: int | None = None) -> None:
         """
@@ -115,27 +117,33 @@ class VehicleServer:
             session, number, kind, meta, body = unpack(data)
         except ValueError:
             return
-        last_session, last_number, last_answer = self._last
-        if session == last_session and number <= last_number:
+        last_number, last_answer = self._last.get(session, (-1, b""))
+        if number <= last_number:
             if number == last_number:
                 self.sock.sendto(last_answer, sender)
             return
         try:
-            answer = pack(session, number, kind, *self._do(kind, meta, body))
+            answer = pack(session, number, kind, *self._do(session, kind, meta, body))
         except (ValueError, KeyError, TypeError, gym.error.Error) as error:
             answer = pack(session, number, kind, {"error": str(error)})
-        self._last = session, number, answer
+        self._last = {**dict(list(self._last.items())[-MOST_LEARNERS:]), session: (number, answer)}
         self.sock.sendto(answer, sender)
 
-    def _do(self, kind: int, meta: dict[str, Any], body: bytes) -> tuple[dict[str, Any], bytes]:
+    def _do(self, session: bytes, kind: int, meta: dict[str, Any], body: bytes) -> tuple[dict[str, Any], bytes]:
         env = self.env
         if kind == SPACES:
             found = {name: space_of(getattr(env, name)) for name in ("observation_space", "action_space")}
             return {**found, "render_fps": env.metadata.get("render_fps"), "env": env.spec.id if env.spec else str(env)}, b""
         if kind == RESET:
+            self._drives = session
             self.episodes += 1
             observation, info = env.reset(seed=meta["seed"], options=meta["options"])
             return {"info": reported(info)}, observation.astype(np.float32).tobytes()
+        if session != self._drives:
+            raise ValueError(
+                "another learner has reset the vehicle since. It has one at a time: leave out what evaluates beside the "
+                "training (rl_zoo3 train: --eval-freq -1)"
+            )
         assert isinstance(env.action_space, spaces.Box)
         action = np.frombuffer(body, np.float32).reshape(env.action_space.shape)
         if not np.isfinite(action).all():
