@@ -70,6 +70,8 @@ NOT_APPLICABLE: list[tuple[tuple[str, ...], str, str]] = [
     (("SACLag",), "test_n_steps_", COSTS),
     (("SACLag",), "test_run[", COSTS),
     (("PPOLag",), "test_vec_with_ppo", "its environment gives empty infos, which tell no costs"),
+    (("GAIL",), "test_rollout_success_rate_onpolicy_algo", BOX_ONLY),
+    (GUIDED, "test_no_resource_warning", "warns of ent_coef='auto', and warnings are errors there"),
     (("PPOLag", "GAIL"), "test_ppo[-0.2", "refuses a negative clip_range_vf in the constructor, SB3 while learning"),
     (("PPOLag", "GAIL"), "test_ppo_warnings", "says its own name in the warning"),
     (("PPOLag",), "test_gae_computation", "needs a policy with a value of the costs"),

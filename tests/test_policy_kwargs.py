@@ -147,3 +147,25 @@ def test_a_shared_features_extractor_learns(name):
     assert actor.features_extractor.scale.item() != 1
     if name not in ON_POLICY:
         assert model.policy.critic.features_extractor is actor.features_extractor
+
+
+@pytest.mark.filterwarnings("ignore:.*no human is in the loop")
+@pytest.mark.parametrize("name", ALL)
+def test_spaces_of_double_precision(name):
+    class Double(Walk):
+        observation_space = spaces.Box(-100, 100, (2,), np.float64)
+        action_space = spaces.Box(-1, 1, (2,), np.float64)
+
+        def reset(self, seed=None, options=None):
+            return super().reset(seed=seed)[0].astype(np.float64), {}
+
+        def step(self, action):
+            assert action.dtype == np.float64
+            observation, *rest = super().step(action)
+            return observation.astype(np.float64), *rest
+
+    kwargs = {}
+    if name in (*OFFLINE, "GAIL"):
+        kwargs["dataset"] = demonstrations(observation_space=Double.observation_space, action_space=Double.action_space)
+    model = make_any(name, Double(), **kwargs).learn(30)
+    assert all(th.isfinite(parameter).all() for parameter in model.policy.parameters())

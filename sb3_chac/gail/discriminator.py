@@ -86,7 +86,7 @@ class Discriminator(nn.Module):
             return scaled, F.one_hot(actions.long().flatten(), int(self.action_space.n)).float()
         low, high = (th.as_tensor(bound, device=actions.device) for bound in (self.action_space.low, self.action_space.high))
         actions = 2.0 * (actions.clamp(low, high) - low) / (high - low) - 1.0
-        return scaled, actions.flatten(start_dim=1)
+        return scaled, actions.float().flatten(start_dim=1)
 
     def forward(self, observations: th.Tensor, actions: th.Tensor) -> th.Tensor:
         """
