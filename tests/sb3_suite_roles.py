@@ -68,6 +68,7 @@ NOT_APPLICABLE: list[tuple[tuple[str, ...], str, str]] = [
     (("CQL",), "test_state_dependent_noise", NO_SDE),
     (("SACLag",), "test_her", COSTS),
     (("SACLag",), "test_n_steps_", COSTS),
+    (("SACLag",), "test_save_load_replay_buffer", COSTS),
     (("SACLag",), "test_run[", COSTS),
     (("PPOLag",), "test_vec_with_ppo", "its environment gives empty infos, which tell no costs"),
     (("GAIL",), "test_rollout_success_rate_onpolicy_algo", BOX_ONLY),

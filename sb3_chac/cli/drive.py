@@ -300,14 +300,14 @@ def wait_for_end(window: Any, drive_run: Any) -> None:
     Show the window until the drive is over.
 
     :param window: of the cockpit
-    :param drive_run: that it shows. Ctrl-C ends it as Q does
+    :param drive_run: that it shows. Ctrl-C and SIGTERM end it as Q does
     """
     while True:
         try:
             window.run(drive_run.drive, lambda: drive_run.is_over)
             drive_run.thread.join()
             return
-        except KeyboardInterrupt:
+        except (KeyboardInterrupt, SystemExit):
             drive_run.drive.quit()
 
 
