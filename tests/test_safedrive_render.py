@@ -308,3 +308,18 @@ def test_network_has_the_route(blocks):
             assert abs(lateral) < 1e-6 and abs(wrap_angle(lane.heading_at(s) - heading)) < 1e-6
     env.reset(options={"scenario": 7})
     assert env.road.network is not network
+
+
+def test_corridors_are_painted_as_far_as_they_are_free():
+    env = make(show_corridors=True, blocks="SS", until=0.3, traffic_density=0, obstacle_density=0)
+    shown = env.render()
+    env.show_corridors = False
+    plain = env.render()
+    rows, columns = np.nonzero((shown != plain).any(axis=2))
+    assert 1000 < len(rows) < 60_000
+    blue = (np.abs(shown[rows, columns].astype(int) - rendering.FREE) < 60).all(axis=1).mean()
+    assert blue > 0.5  # nothing is there but the road
+    assert env.corridors.shape == (48,)
+    with pytest.raises(ValueError, match="show_corridors"):
+        make(show_corridors=True, corridors=False)
+    assert make(corridors=False).corridors is None

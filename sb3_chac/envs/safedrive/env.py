@@ -106,6 +106,7 @@ class SafeDriveEnv(DrivingEnv):
     :param corridors: whether the observation ends with the corridors
     :param render_mode: "rgb_array", "human" or None
     :param show_lidar: whether pictures show the lidar's rays
+    :param show_corridors: whether pictures show how far the corridors are free: blue where 40 m, red where something is near
     :raises ValueError: for an argument out of its range
     """
 
@@ -128,6 +129,7 @@ class SafeDriveEnv(DrivingEnv):
         corridors: bool = True,
         render_mode: str | None = None,
         show_lidar: bool = False,
+        show_corridors: bool = False,
     ) -> None:
         check_integer("start_scenario", start_scenario, low=-(2**62))
         check_integer("num_scenarios", num_scenarios, low=1)
@@ -156,7 +158,9 @@ class SafeDriveEnv(DrivingEnv):
             collision_penalty,
         )
         self.arrival_reward, self.out_of_road_penalty = arrival_reward, out_of_road_penalty
-        self.show_lidar = show_lidar
+        if show_corridors and not corridors:
+            raise ValueError("show_corridors: there are none with corridors=False, leave out one of the two.")
+        self.show_lidar, self.show_corridors = show_lidar, show_corridors
 
         self.action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
         self.lidar = Lidar()
@@ -306,6 +310,11 @@ class SafeDriveEnv(DrivingEnv):
             self._find_boxes()
 
     # What the agent is told
+
+    @property
+    def corridors(self) -> np.ndarray | None:
+        """Closeness of the nearest hit in each corridor of the last observation, see ``Corridors``; None without corridors."""
+        return None if self._corridors is None else self._corridors.last
 
     def _observe(self) -> np.ndarray:
         ego = self.ego

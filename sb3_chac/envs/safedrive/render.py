@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sb3_chac.envs.driving.corridors import CURVATURES, FAR, LATERALS, N_ARCS
 from sb3_chac.envs.driving.display import (
     ASPHALT,
     BLACK,
@@ -34,6 +35,7 @@ COLOURS = {
     "black": BLACK,
 }  # fmt: skip
 WRECK, HAZARD = (225, 50, 45), (255, 180, 0)
+FREE = (90, 190, 255)  # of corridors that are free
 ARROW, RAY, ECHO = (140, 176, 158), (190, 225, 140), (250, 255, 80)
 
 
@@ -60,6 +62,8 @@ class Viewer(Display):
                 self._paint_parked(position, heading)
             else:
                 obstacles.append((env.map.obstacles[index].kind, position))
+        if env.show_corridors:
+            self._paint_corridors()
         if env.show_lidar:
             self._paint_lidar()
         self._paint_vehicle(env.ego.position, env.ego.heading, self._ego_colour, env.ego.steering)
@@ -79,10 +83,13 @@ class Viewer(Display):
         :param s: [m] along the route; beyond its end it goes on straight
         :return: [m], shape (2,)
         """
-        route = self.env.map.route
-        x, y, heading, _ = route[int(np.clip(s / SPACING, 0, len(route) - 1))]
-        rest = s - np.clip(int(s / SPACING), 0, len(route) - 1) * SPACING
+        x, y, heading, _ = self.env.map.route[self._index(s)]
+        rest = s - self._index(s) * SPACING
         return np.array([x + rest * np.cos(heading), y + rest * np.sin(heading)])
+
+    def _index(self, s: float) -> int:
+        """Return the index of the point of the route that is nearest to ``s`` [m]."""
+        return int(np.clip(s / SPACING, 0, len(self.env.map.route) - 1))
 
     def _areas(self) -> Iterable[Area]:
         for area in areas(self.env.map, self.env.map.finish):
@@ -107,6 +114,35 @@ class Viewer(Display):
             draw.line(self.canvas, RAY, start, end)
             if distance < env.lidar.reach:
                 draw.circle(self.canvas, ECHO, end, 2.5 * FINE)
+
+    def _paint_corridors(self) -> None:
+        """The narrow strips along the route and the narrow arcs of the ego, as far as each is free."""
+        env = self.env
+        if env.corridors is None:
+            return
+        free = FAR * (1 - env.corridors)
+        for offset, reach in zip(LATERALS, free[N_ARCS : N_ARCS + len(LATERALS)], strict=True):
+            s = np.linspace(env.s, env.s + reach, 20)
+            x, y, heading = np.array([(*self._on_route(a), env.map.route[self._index(a), 2]) for a in s]).T
+            self._paint_way(np.stack([x - offset * np.sin(heading), y + offset * np.cos(heading)], axis=1), reach)
+        for curvature, reach in zip(CURVATURES, free[: len(CURVATURES)], strict=True):
+            angles = np.linspace(0, min(reach * abs(curvature), np.pi), 20)
+            if curvature == 0:
+                points = np.stack([np.linspace(0, reach, 20), np.zeros(20)], axis=1)
+            else:
+                points = np.stack([np.sin(angles) / abs(curvature), (1 - np.cos(angles)) / curvature], axis=1)
+            self._paint_way(env.ego.position + points @ turned(env.ego.heading), reach)
+
+    def _paint_way(self, points: np.ndarray, reach: float) -> None:
+        """
+        Paint one corridor.
+
+        :param points: [m] on it, shape (n, 2)
+        :param reach: [m] as far as it is free
+        """
+        share = reach / FAR
+        colour = tuple(int(near + share * (free - near)) for near, free in zip(WRECK, FREE, strict=True))
+        self.pygame.draw.lines(self.canvas, colour, False, self._to_canvas(points).tolist(), 2 * FINE)
 
     def _paint_parked(self, position: np.ndarray, heading: float) -> None:
         """With hazard lights."""
