@@ -352,6 +352,7 @@ def main(given: list[str]) -> None:
     args = parser.parse_args(given)
     RESULTS.mkdir(parents=True, exist_ok=True)
     signal.signal(signal.SIGINT, signal.SIG_DFL)
+    os.environ["MINARI_DATASETS_PATH"] = tempfile.mkdtemp()
     warnings.simplefilter("ignore")
     for part in args.only:
         with (RESULTS / f"{part}.csv").open("w", newline="") as file:

@@ -10,12 +10,14 @@ from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
+from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.utils import FloatSchedule, check_for_correct_spaces
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 import sb3_chac.envs  # noqa: F401  (registers our environments)
+from sb3_chac.common.checks import is_finite
 from sb3_chac.envs.driving.corridors import corridors_remedy
 from sb3_chac.human.experts import ModelExpert, make_expert
 
@@ -225,6 +227,25 @@ class Runner:
         except (ValueError, KeyError) as error:
             raise NotEvaluable(f"expert {policy!r} is not available in {self.env.unwrapped}: {error}") from error
 
+    def _act(self, observation: Any) -> Any:
+        """
+        Ask the driver for an action.
+
+        :raises NotEvaluable: if an expert fails, or returns what is no action
+        """
+        if not isinstance(self.task.policy, str):
+            return self.driver(observation)
+        try:
+            action = self.driver(observation)
+        except Exception as error:
+            raise NotEvaluable(f"expert {self.task.policy!r} raised {type(error).__name__}: {error}") from error
+        space = self.env.action_space
+        if isinstance(space, spaces.Box) and (np.shape(action) != space.shape or not is_finite(action)):
+            raise NotEvaluable(
+                f"expert {self.task.policy!r} must return finite numbers of shape {space.shape}, returned {action!r}."
+            )
+        return action
+
     def seed(self, number: int) -> int:
         """
         Derive the seed of an episode.
@@ -262,7 +283,7 @@ class Runner:
         terminated = truncated = False
         on_step()
         while not (terminated or truncated):
-            action = self.driver(observation)
+            action = self._act(observation)
             actions.append(copy.deepcopy(action))  # the environment may change what it is given
             observation, reward, terminated, truncated, info = self.env.step(action)
             rewards.append(float(reward))
