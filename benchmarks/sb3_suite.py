@@ -1,7 +1,7 @@
 """Stable-Baselines3's own test suite, asked of all eleven algorithms, each in the role of its nearest relative.
 
-    python benchmarks/sb3_suite.py                       # all, three minutes of one core
-    python benchmarks/sb3_suite.py --only PVP GAIL
+    python benchmarks/sb3_suite.py                       # all, ten minutes of one core
+    python benchmarks/sb3_suite.py --only PVP GAIL       # the others' rows stay
 
 The tests are those in the source distribution of the installed version. Results go to benchmarks/results/sb3-suite: a row a
 test in tests.csv, and table.md. What cannot apply is listed there with its reason, from tests/sb3_suite_roles.py.
@@ -9,6 +9,7 @@ test in tests.csv, and table.md. What cannot apply is listed there with its reas
 
 import argparse
 import csv
+import io
 import os
 import subprocess
 import sys
@@ -101,7 +102,8 @@ def main(arguments: list[str]) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", nargs="+", choices=ROLES, default=list(ROLES), metavar="NAME", help="algorithms (all)")
     args = parser.parse_args(arguments)
-    rows: list[list[str]] = []
+    with (RESULTS / "tests.csv").open(newline="") if (RESULTS / "tests.csv").is_file() else io.StringIO() as file:
+        rows = [row for row in csv.reader(file) if row[0] in ROLES and row[0] not in args.only]
     with tempfile.TemporaryDirectory() as work:
         suite = fetch(Path(work))
         for names in groups(args.only):

@@ -71,6 +71,8 @@ NOT_APPLICABLE: list[tuple[tuple[str, ...], str, str]] = [
     (("SACLag",), "test_save_load_replay_buffer", COSTS),
     (("SACLag",), "test_run[", COSTS),
     (("PPOLag",), "test_vec_with_ppo", "its environment gives empty infos, which tell no costs"),
+    (OFFLINE, "test_no_resource_warning", NO_BUFFER),
+    (("CQL",), "test_features_extractor_target_net", "has no train(): learn(n) makes n gradient steps"),
     (("GAIL",), "test_rollout_success_rate_onpolicy_algo", BOX_ONLY),
     (GUIDED, "test_no_resource_warning", "warns of ent_coef='auto', and warnings are errors there"),
     (("PPOLag", "GAIL"), "test_ppo[-0.2", "refuses a negative clip_range_vf in the constructor, SB3 while learning"),
