@@ -467,3 +467,9 @@ def test_replay_says_how_far_it_led_elsewhere(capsys, tmp_path):
     output = capsys.readouterr().out
     assert "recorded 200 steps" in output and "the returns differ by 0," not in output
     assert "the first difference is after step 1" in output
+
+
+def test_a_rule_without_a_novice_is_refused(capsys):
+    with pytest.raises(SystemExit) as ended:
+        command(["record", "--expert", "scripted", "--dataset", "toys/rule-v0", "--steps", "5", "--rule", "never"])
+    assert ended.value.code == 2 and "--rule never: " in capsys.readouterr().err

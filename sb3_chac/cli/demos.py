@@ -64,9 +64,8 @@ def make_parser() -> argparse.ArgumentParser:
     who.add_argument("--novice", type=Path, metavar="MODEL.zip", help="who drives unless the expert takes over")
     who.add_argument(
         "--rule",
-        default="risk",
         metavar="NAME",
-        help="when the expert takes over: risk, disagreement, always, never or package.module:function (%(default)s)",
+        help="when the expert takes over: risk (default), disagreement, always, never or package.module:function",
     )
     where = new.add_argument_group("where")
     where.add_argument("--env", default=DEFAULT_ENV, metavar="ID", help="environment, also module:ID (default: %(default)s)")
@@ -143,6 +142,8 @@ def run_record(args: argparse.Namespace) -> None:
     for option, low in [("steps", 1), ("seed", 0), ("jobs", 1)]:
         if getattr(args, option) < low:
             raise NotEvaluable(f"--{option} must be at least {low}, got {getattr(args, option)}.")
+    if args.rule is not None and args.novice is None:
+        raise NotEvaluable(f"--rule {args.rule}: it says when the expert takes over from a novice, give --novice, too.")
     env_kwargs = parse_env_kwargs(args.env_kwargs)
     env: str | Callable[..., Any] = args.env
     acting: BaseAlgorithm | str = args.expert
@@ -154,7 +155,7 @@ def run_record(args: argparse.Namespace) -> None:
     if args.novice is not None:
         if normalize is not None:
             raise NotEvaluable(f"--expert {args.expert} takes over raw observations, but was trained with normalized ones.")
-        env = WatchedEnv(args.env, expert if isinstance(expert, str) else saved_model(expert), args.rule)
+        env = WatchedEnv(args.env, expert if isinstance(expert, str) else saved_model(expert), args.rule or "risk")
         acting, normalize = find_model(args.novice, args.env, env_kwargs)
     folder = record(
         args.dataset,
