@@ -352,14 +352,14 @@ def main(given: list[str]) -> None:
     args = parser.parse_args(given)
     RESULTS.mkdir(parents=True, exist_ok=True)
     signal.signal(signal.SIGINT, signal.SIG_DFL)
-    os.environ["MINARI_DATASETS_PATH"] = tempfile.mkdtemp()
+    os.environ["MINARI_DATASETS_PATH"] = datasets = tempfile.mkdtemp()
     warnings.simplefilter("ignore")
     for part in args.only:
         with (RESULTS / f"{part}.csv").open("w", newline="") as file:
             writer = csv.writer(file, lineterminator="\n")
             writer.writerow(Attempt._fields)
             for one in PARTS[part]():
-                writer.writerow(one)
+                writer.writerow(one._replace(said=one.said.replace(datasets, "datasets")))
                 file.flush()
                 if not one.clear:
                     print(f"{part}: {one.tried}\n    {one.said}", flush=True)
