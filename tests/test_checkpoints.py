@@ -9,10 +9,12 @@ import subprocess
 import sys
 import zipfile
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch as th
+from eleven import ALL, OFFLINE, Walk, demonstrations, make_any
 from guided_toys import make_guided
 from shell import FOREVER, wait_until
 from stable_baselines3 import PPO, SAC
@@ -35,6 +37,7 @@ from sb3_chac.common.checkpoints import (
     verify,
 )
 from sb3_chac.zoo.algorithms import ALGORITHMS
+from sb3_chac.zoo.experiments import learn_ours
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 SMALL = {"policy_kwargs": {"net_arch": [8]}, "buffer_size": 200}
@@ -279,3 +282,37 @@ def test_the_command_answers_a_signal_with_one_sentence(tmp_path, number):
     (checkpoint,) = checkpoints(run / "checkpoints")
     verify(checkpoint)
     assert (run / "SafeDrive-v0.zip").is_file()
+
+
+@pytest.mark.filterwarnings("ignore:.*no human is in the loop", "ignore:.*mini-batch")
+@pytest.mark.parametrize("name", [name for name in ALL if name not in OFFLINE])
+def test_an_error_of_the_environment_leaves_what_was_driven_before(name, tmp_path):
+    class Breaks(Walk):
+        count = 0
+
+        def step(self, action):
+            Breaks.count += 1
+            observation, *rest = super().step(action)
+            return observation * (np.nan if Breaks.count > 40 else 1), *rest
+
+    model, checkpoint = make_any(name, Breaks()), ResumableCheckpoint(10_000, tmp_path, "Walk-v0")
+    manager = SimpleNamespace(callbacks=[checkpoint], steps_done=None)
+    with pytest.raises(
+        ValueError, match=r"^observation of environment 0.*Stopped by this error at step \d+; go on: sb3-chac resume"
+    ):
+        learn_ours(lambda model: model.learn(100, callback=checkpoint), manager, model)
+    newest = newest_checkpoint(checkpoint.folder)
+    assert newest is not None and int(newest.name) >= 36
+    loaded = type(model).load(newest / "Walk-v0.zip", **({"dataset": demonstrations()} if name == "GAIL" else {}))
+    assert loaded.num_timesteps == model.num_timesteps
+
+
+def test_an_error_before_the_first_step_leaves_nothing(tmp_path):
+    checkpoint = ResumableCheckpoint(10_000, tmp_path, "Walk-v0")
+
+    def fails(model):
+        raise ValueError("no such thing")
+
+    with pytest.raises(ValueError, match=r"^no such thing$"):
+        learn_ours(fails, SimpleNamespace(callbacks=[checkpoint], steps_done=None), make_any("DSAC", Walk()))
+    assert not checkpoint.folder.exists()

@@ -8,12 +8,13 @@ import pytest
 import torch as th
 from eleven import ALL, GUIDED, OFFLINE, Walk, make_any
 from gymnasium import spaces
-from gymnasium.wrappers import RescaleAction
+from gymnasium.wrappers import RescaleAction, TimeLimit
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnvWrapper, VecNormalize
 
 from sb3_chac.common.checks import UnsupportedActionSpace
+from sb3_chac.common.contract import read_report
 from sb3_chac.common.demonstrations import load_demonstrations
 from sb3_chac.datasets.recording import record
 from sb3_chac.human import InterventionWrapper
@@ -104,14 +105,38 @@ def rescaled():
     return RescaleAction(Told(gym_hil), np.float32(-0.5), np.float32(1))
 
 
+class Silent(gym.Wrapper):
+    """Overrides step, and has nothing to do with takeovers."""
+
+    def step(self, action):
+        return self.env.step(action)
+
+
+class Telling(gym.Wrapper):
+    """Tells of takeovers in its own units, those of what stands outside."""
+
+    def step(self, action):
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        info = {key: value for key, value in info.items() if "interven" not in key}
+        return observation, reward, terminated, truncated, info | {"intervene_action": np.array([0.25, 0.5])}
+
+
+def test_a_wrapper_that_reports_above_an_action_wrapper_is_believed():
+    model = make_any("PVP", Telling(rescaled())).learn(12)
+    assert len(model.replay_buffer.human) == 12
+
+
 @pytest.mark.parametrize(
     "make_env",
     [
         lambda: DummyVecEnv([rescaled]),
         lambda: SubprocVecEnv([rescaled]),
         lambda: Rescaling(DummyVecEnv([lambda: Told(gym_hil)])),
+        lambda: DummyVecEnv([lambda: Silent(rescaled())]),
+        lambda: DummyVecEnv([lambda: TimeLimit(Silent(Silent(rescaled())), 5)]),
+        lambda: SubprocVecEnv([lambda: Silent(rescaled())]),
     ],
-    ids=["here", "in another process", "VecEnvWrapper"],
+    ids=["here", "in another process", "VecEnvWrapper", "below a wrapper", "below three", "below one, in another process"],
 )
 def test_reports_in_other_units_are_refused(make_env):
     model = make_any("PVP", make_env())
@@ -234,3 +259,14 @@ def test_what_a_record_must_not_hold_is_refused(env, message, tmp_path):
         warnings.simplefilter("ignore")
         recorded(tmp_path, env)
     assert not (tmp_path / "walk-v0").exists()
+
+
+@pytest.mark.parametrize("flag", ["False", "no", b"0", float("nan"), {"a": 1}, 0.5])
+def test_a_flag_that_is_no_boolean_is_refused(flag):
+    with pytest.raises(ValueError, match=r"info\['is_intervention'\] of environment 0 must be a boolean"):
+        read_report({"is_intervention": flag, "intervene_action": np.zeros(2)}, Walk.action_space)
+
+
+@pytest.mark.parametrize(("flag", "takeover"), [(1, True), (0.0, False), (np.array([True]), True), (np.bool_(False), False)])
+def test_flags(flag, takeover):
+    assert read_report({"is_intervention": flag, "intervene_action": np.zeros(2)}, Walk.action_space).takeover is takeover

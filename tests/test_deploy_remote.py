@@ -13,7 +13,7 @@ from stable_baselines3.common.env_checker import check_env
 
 from sb3_chac import DPVP, InterventionWrapper
 from sb3_chac.deploy.metadata import NotDeployable
-from sb3_chac.deploy.remote import LateLink, RemoteVehicle, VehicleServer, pack, unpack
+from sb3_chac.deploy.remote import HEADER, LateLink, RemoteVehicle, VehicleServer, pack, unpack
 
 
 class Cart(gym.Env):
@@ -97,7 +97,7 @@ def test_it_is_an_environment_like_that_of_the_vehicle(vehicle):
     assert info == {"scenario": 3} and observation.tolist() == [0, 0, 0]
     observation, reward, terminated, truncated, info = env.step(np.array([0.5, -0.25], np.float32))
     assert observation.tolist() == [0.5, -0.25, 1] and reward == 0.5 and not terminated and not truncated
-    assert info == {"cost": 0.5}
+    assert info["cost"] == 0.5 and np.isnan(info["nan"])
     env.close()
 
 
@@ -183,9 +183,9 @@ def test_what_the_vehicle_refuses_is_said_and_changes_nothing(vehicle):
     _, address = vehicle(cart)
     env = RemoteVehicle(address)
     env.reset()
-    with pytest.raises(NotDeployable, match="refuses: options: only place is known"):
+    with pytest.raises(NotDeployable, match="refuses: ValueError: options: only place is known"):
         env.reset(options={"nonsense": 1})
-    with pytest.raises(NotDeployable, match="refuses: the action is"):
+    with pytest.raises(NotDeployable, match="refuses: ValueError: the action is"):
         env.step(np.array([np.nan, 0.0], np.float32))
     with pytest.raises(NotDeployable, match="refuses"):
         env.step(np.zeros(5, np.float32))
@@ -221,7 +221,9 @@ def test_packets_of_others_are_left_alone():
     server = VehicleServer(Cart(), Silent())
     whole = pack(bytes(16), 1, 0, {})
     rng = np.random.default_rng(0)
-    for data in [b"", b"x", whole[:30], whole[:-1], b"SB3X" + whole[4:], *(rng.bytes(n) for n in range(1, 90))]:
+    deep = b"[" * 60_000
+    deep = HEADER.pack(b"SB3R", bytes(16), 1, 0, len(deep)) + deep
+    for data in [b"", b"x", deep, whole[:30], whole[:-1], b"SB3X" + whole[4:], *(rng.bytes(n) for n in range(1, 90))]:
         server.answer(data, ("x", 1))
     assert not answers
     server.answer(whole, ("x", 1))
@@ -263,3 +265,90 @@ def test_bad_command_lines(arguments, named, capsys):
     error = capsys.readouterr().err.strip()
     assert ended.value.code == 2 and "\n" not in error
     assert any(name in error for name in named.split("|")), error
+
+
+class Odd(Cart):
+    """Fails in the third step, or reports what is odd."""
+
+    def __init__(self, info=None, error=None):
+        super().__init__()
+        self.info, self.error = info or {}, error
+
+    def step(self, action):
+        if self.error is not None and self.steps == 2:
+            raise self.error
+        observation, reward, terminated, truncated, _ = super().step(action)
+        return observation, reward, terminated, truncated, dict(self.info)
+
+
+@pytest.mark.parametrize("error", [RuntimeError("broken"), IndexError("broken"), OSError("broken"), AssertionError("broken")])
+def test_a_vehicle_that_fails_says_so_and_goes_on(vehicle, error):
+    _, address = vehicle(Odd(error=error))
+    env = RemoteVehicle(address, patience=20.0)
+    for _ in range(2):
+        env.reset()
+        env.step(np.zeros(2, np.float32))
+        env.step(np.zeros(2, np.float32))
+        with pytest.raises(NotDeployable, match=f"refuses: {type(error).__name__}: broken"):
+            env.step(np.zeros(2, np.float32))
+    env.close()
+
+
+@pytest.mark.parametrize(
+    ("info", "learner"),
+    [
+        ({"cost": np.array([0.5])}, {"cost": 0.5}),
+        ({"cost": np.float32(2)}, {"cost": 2.0}),
+        ({"intervene_action": np.array([0.5, 0.0])}, {"intervene_action": [0.5, 0.0]}),
+        (
+            {"intervene_action": None, "is_intervention": np.array([False])},
+            {"intervene_action": None, "is_intervention": False},
+        ),
+    ],
+)
+def test_what_a_vehicle_reports_arrives(vehicle, info, learner):
+    _, address = vehicle(Odd(info))
+    env = RemoteVehicle(address)
+    env.reset()
+    assert env.step(np.zeros(2, np.float32))[4] == learner
+    env.close()
+
+
+def test_a_cost_that_is_no_number_is_not_dropped(vehicle):
+    _, address = vehicle(Odd({"cost": float("nan")}))
+    model = DPVP("MlpPolicy", RemoteVehicle(address), learning_starts=5, policy_kwargs=dict(net_arch=[8]), seed=0)
+    with pytest.raises(ValueError, match=r"info\['cost'\]"):
+        model.learn(10)
+
+
+def test_spaces_of_a_vehicle(vehicle):
+    class Wide(Cart):
+        observation_space = spaces.Box(-np.inf, np.inf, (3,), np.float32)
+
+    _, address = vehicle(Wide())
+    assert RemoteVehicle(address).observation_space == Wide.observation_space
+    for name, space in [
+        ("observation_space", spaces.Box(0, 255, (84, 84, 3), np.uint8)),
+        ("observation_space", spaces.Box(-1.0, 1.0, (20_000,), np.float32)),
+        ("action_space", spaces.Box(0, 10, (2,), np.int64)),
+        ("action_space", spaces.Discrete(2)),
+    ]:
+        cart = Cart()
+        setattr(cart, name, space)
+        with pytest.raises(NotDeployable, match=name):
+            VehicleServer(cart, None)
+
+
+def test_actions_stay_in_their_bounds(vehicle):
+    cart = Cart()
+    cart.action_space = spaces.Box(0.5, 1.0, (2,), np.float32)
+    late = LateLink(cart, latency=0.3)
+    late.reset()
+    late.step(np.full(2, 0.75, np.float32))
+    np.testing.assert_allclose(cart.actions, [[0.5, 0.5]])
+    _, address = vehicle(cart)
+    env = RemoteVehicle(address)
+    env.reset()
+    with pytest.raises(NotDeployable, match="out of Box"):
+        env.step(np.array([1e9, 0.75], np.float32))
+    env.close()

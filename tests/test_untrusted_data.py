@@ -130,6 +130,8 @@ def test_a_registered_environment_keeps_the_keywords_of_the_file():
     assert spec.kwargs["horizon"] == 7 and spec.entry_point == gym.spec("SafeDrive-v0").entry_point
     with pytest.raises(NotEvaluable, match=r"^a file: the environment 'Nowhere-v0' is not registered"):
         registered_spec(EnvSpec("Nowhere-v0", entry_point="os:system"), "a file")
+    with pytest.raises(NotEvaluable, match=r"^a file: RemoteVehicle-v0 at 10.0.0.1:5700 is a vehicle"):
+        registered_spec(EnvSpec("RemoteVehicle-v0", kwargs={"address": "10.0.0.1:5700"}), "a file")
 
 
 START = """

@@ -52,7 +52,7 @@ def read_report(info: dict[str, Any], action_space: spaces.Space, env_idx: int =
     :raises ValueError: if the human acted and the action is missing, of another shape, or NaN or infinite; names the key
     """
     flag = _first(info, FLAGS)
-    takeover = _truth(flag[1]) if flag else _first(info, REPORTED_ACTIONS) is not None
+    takeover = _truth(*flag, env_idx) if flag else _first(info, REPORTED_ACTIONS) is not None
     if not takeover:
         return Report(False, None, flag is not None or any(key in info for key in REPORTED_ACTIONS))
     found = _first(info, ACTIONS)
@@ -85,8 +85,19 @@ def _first(info: dict[str, Any], keys: Sequence[str]) -> tuple[str, Any] | None:
     return next(((key, named[key]) for key in keys if named.get(key) is not None), None)
 
 
-def _truth(value: Any) -> bool:
-    return bool(np.any(np.asarray(value)))
+def _truth(key: str, value: Any, env_idx: int) -> bool:
+    """
+    Read a flag.
+
+    :raises ValueError: for what is neither a boolean nor 0 or 1, nor an array of them
+    """
+    array = np.asarray(value)
+    if array.dtype != bool and not (np.issubdtype(array.dtype, np.number) and np.isin(array, (0, 1)).all()):
+        raise ValueError(
+            f"info[{key!r}] of environment {env_idx} must be a boolean, got {value!r}: mend the environment. Nothing of this "
+            "step was stored."
+        )
+    return bool(np.any(array))
 
 
 def scaled(action: np.ndarray, action_space: spaces.Space, env_idx: int) -> np.ndarray:
@@ -187,15 +198,38 @@ def action_wrapper_above_report(env: gym.Env) -> gym.Wrapper | None:
     Find a wrapper that changes actions above the one that reports takeovers.
 
     :param env: reports takeovers, somewhere among its wrappers
-    :return: the wrapper that changes actions above all that may report them (what overrides ``step``), None if there is none
+    :return: the wrapper that changes actions above all that may report them, None if there is none
     """
     while isinstance(env, gym.Wrapper):
-        if type(env).step.__module__.partition(".")[0] not in ("gymnasium", "stable_baselines3"):
+        if _may_report(type(env)):
             return None
         if isinstance(env, gym.ActionWrapper):
             return env
         env = env.env
     return None
+
+
+def _may_report(wrapper: type) -> bool:
+    """
+    Tell whether a wrapper may report takeovers: whether anything in its class speaks of them.
+
+    :param wrapper: class of it
+    """
+    words = ("interven", "teleop", TAKEOVER, APPLIED_ACTION)
+    for owner in wrapper.__mro__:
+        if owner.__module__.partition(".")[0] in ("gymnasium", "stable_baselines3", "typing", "builtins"):
+            continue
+        for member in vars(owner).values():
+            member = getattr(member, "fget", None) or getattr(member, "__func__", member)
+            pending = [member.__code__] if hasattr(member, "__code__") else []
+            while pending:
+                code = pending.pop()
+                pending += [constant for constant in code.co_consts if hasattr(constant, "co_consts")]
+                texts = [*code.co_names, *(constant for constant in code.co_consts if isinstance(constant, str))]
+                texts += [word for part in code.co_consts if isinstance(part, tuple) for word in part if isinstance(word, str)]
+                if any(word in text.lower() for text in texts for word in words):
+                    return True
+    return False
 
 
 class _ReportsBelow:

@@ -20,6 +20,7 @@ MAGIC = b"SB3R"
 HEADER = struct.Struct("!4s16sQBI")  # magic, session of the learner, number of the request, kind, length of the JSON text
 SPACES, RESET, STEP = range(3)
 LARGEST = 65_000  # [bytes] of a packet
+ROUNDING = 1e-4  # that an action may be out of its bounds
 RESEND = 0.05  # [s] without an answer after which a request is sent again
 MOST_LEARNERS = 8  # whose last answers are kept
 PATIENCE = 10.0  # [s] without an answer after which the vehicle is given up
@@ -55,7 +56,9 @@ class LateLink(gym.Wrapper):
 
     def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
         self.channel, self.steps, self.newest = Channel(self.rng, *self.settings), 0, -1
-        self.action = np.zeros(self.action_space.shape or (), self.action_space.dtype)
+        space = self.action_space
+        assert isinstance(space, spaces.Box)
+        self.action = np.clip(np.zeros(space.shape, space.dtype), space.low, space.high)
         observation, info = self.env.reset(**kwargs)
         return self._sensed(observation), info
 
@@ -89,9 +92,14 @@ class VehicleServer:
     """
 
     def __init__(self, env: gym.Env, sock: socket.socket) -> None:
+        found = []
         for name in ("observation_space", "action_space"):
-            if not isinstance(getattr(env, name), spaces.Box):
-                raise NotDeployable(f"{name} must be a Box, got {getattr(env, name)}.")
+            space = getattr(env, name)
+            if not isinstance(space, spaces.Box) or not np.issubdtype(space.dtype, np.floating):
+                raise NotDeployable(f"{name} must be a Box of floating point numbers, got {space}.")
+            found.append(space)
+        if len(json.dumps([*map(space_of, found)])) + 4 * int(np.prod(found[0].shape)) > LARGEST // 2:
+            raise NotDeployable(f"observation_space: {env.observation_space} is too large for one packet of {LARGEST} bytes.")
         self.env, self.sock = env, sock
         self.steps = self.episodes = 0
         self._last: dict[bytes, tuple[int, bytes]] = {}  # session -> number and answer of its last request
@@ -124,8 +132,10 @@ class VehicleServer:
             return
         try:
             answer = pack(session, number, kind, *self._do(session, kind, meta, body))
-        except (ValueError, KeyError, TypeError, gym.error.Error) as error:
-            answer = pack(session, number, kind, {"error": str(error)})
+            if len(answer) > LARGEST:
+                raise ValueError(f"the answer has {len(answer)} bytes, more than {LARGEST} in a packet: info is too long")
+        except Exception as error:  # of the environment, the person or the request: the vehicle goes on for the next one
+            answer = pack(session, number, kind, {"error": f"{type(error).__name__}: {error}"[:1000]})
         self._last = {**dict(list(self._last.items())[-MOST_LEARNERS:]), session: (number, answer)}
         self.sock.sendto(answer, sender)
 
@@ -141,13 +151,15 @@ class VehicleServer:
             return {"info": reported(info)}, observation.astype(np.float32).tobytes()
         if session != self._drives:
             raise ValueError(
-                "another learner has reset the vehicle since. It has one at a time: leave out what evaluates beside the "
-                "training (rl_zoo3 train: --eval-freq -1)"
+                "it was started anew, or another learner has reset the vehicle since (it has one at a time: leave out what "
+                "evaluates beside the training, rl_zoo3 train: --eval-freq -1); reset() goes on"
             )
         assert isinstance(env.action_space, spaces.Box)
         action = np.frombuffer(body, np.float32).reshape(env.action_space.shape)
-        if not np.isfinite(action).all():
-            raise ValueError(f"the action is {action}")
+        low, high = env.action_space.low, env.action_space.high
+        if not np.isfinite(action).all() or np.any((action < low - ROUNDING) | (action > high + ROUNDING)):
+            raise ValueError(f"the action is {action}, out of {env.action_space}")
+        action = np.clip(action, low, high)
         observation, reward, terminated, truncated, info = env.step(action.astype(env.action_space.dtype))
         self.steps += 1
         ends = {"reward": float(reward), "terminated": bool(terminated), "truncated": bool(truncated)}
@@ -247,7 +259,7 @@ def pack(session: bytes, number: int, kind: int, meta: dict[str, Any], body: byt
     :param meta: what JSON can hold
     :param body: numbers, float32
     """
-    text = json.dumps(meta, allow_nan=False).encode()
+    text = json.dumps(meta).encode()  # NaN and infinite included: the learner judges them
     return HEADER.pack(MAGIC, session, number, kind, len(text)) + text + body
 
 
@@ -263,7 +275,10 @@ def unpack(data: bytes) -> tuple[bytes, int, int, dict[str, Any], bytes]:
     magic, session, number, kind, length = HEADER.unpack_from(data)
     if magic != MAGIC or kind not in (SPACES, RESET, STEP):
         raise ValueError("not a packet of ours")
-    meta = json.loads(data[HEADER.size : HEADER.size + length])
+    try:
+        meta = json.loads(data[HEADER.size : HEADER.size + length])
+    except RecursionError as error:
+        raise ValueError("not a packet of ours") from error
     if not isinstance(meta, dict):
         raise ValueError("not a packet of ours")
     return session, number, kind, meta, data[HEADER.size + length :]
@@ -288,8 +303,11 @@ def reported(info: dict[str, Any]) -> dict[str, Any]:
     """
     found: dict[str, Any] = {}
     for key, value in info.items():
-        value = value.item() if isinstance(value, np.generic) else value
-        if isinstance(value, bool | int | str) or (isinstance(value, float) and math.isfinite(value)):
+        if isinstance(value, np.generic) or (isinstance(value, np.ndarray) and value.size == 1):
+            value = value.item()
+        elif isinstance(value, np.ndarray) and key in (*contract.REPORTED_ACTIONS, *contract.FLAGS):
+            value = value.tolist()
+        if isinstance(value, bool | int | float | str) or key in (*contract.REPORTED_ACTIONS, *contract.FLAGS):
             found[key] = value
     if contract.TAKEOVER in info:
         takeover = bool(found.pop(contract.TAKEOVER))

@@ -18,6 +18,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 import sb3_chac.envs  # noqa: F401  (registers our environments)
 from sb3_chac.common.checks import is_finite
+from sb3_chac.envs import REHEARSALS
 from sb3_chac.envs.driving.corridors import corridors_remedy
 from sb3_chac.human.experts import ModelExpert, make_expert
 
@@ -76,6 +77,8 @@ def registered_spec(spec: EnvSpec, source: str) -> EnvSpec:
             f"{source}: the environment {spec.id!r} is not registered, and files import nothing: import the package that "
             "registers it first."
         )
+    if spec.id in REHEARSALS and "address" in spec.kwargs:
+        raise NotEvaluable(f"{source}: {spec.id} at {spec.kwargs['address']} is a vehicle, which no file may drive.")
     if spec.additional_wrappers:
         names = ", ".join(wrapper.name for wrapper in spec.additional_wrappers)
         raise NotEvaluable(f"{source}: {spec.id} stands in wrappers ({names}), which are not imported from a file.")

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import torch as th
 from huggingface_sb3 import EnvironmentName
 from rl_zoo3 import utils
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -115,6 +116,9 @@ def load_model(
     except Exception as error:  # whatever a model of another algorithm, version or environment leads to
         reason = f"{error or type(error).__name__}{remedy_for(path, env)}"
         raise NotEvaluable(f"{path} cannot be loaded as {algo} for {env.unwrapped}: {reason}") from error
+    broken = [name for name, value in model.policy.state_dict().items() if not th.isfinite(value).all()]
+    if broken:
+        raise NotEvaluable(f"{path} holds weights that are NaN or infinite ({broken[0]}): take another checkpoint.")
     if control is not None:
         if control_of(model) is None:
             raise NotEvaluable(f"{control!r} is a policy of C-HAC models, {path} is a model of {algo}.")

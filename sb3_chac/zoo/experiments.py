@@ -219,6 +219,11 @@ def learn_ours(original: Callable[..., None], manager: Any, model: Any) -> None:
         sys.exit(stopped.exit_code)
     except OSError as error:  # such as a full disk
         raise OSError(checkpoint.farewell(str(error))) from error
+    except (ValueError, ExpertError, RuleError) as error:  # what was driven before is kept
+        if model.num_timesteps == (manager.steps_done or 0):
+            raise
+        checkpoint.save()
+        raise type(error)(f"{error} {checkpoint.farewell('this error')}") from error
 
 
 def go_on(original: Callable[..., None], manager: Any, model: Any) -> None:
