@@ -473,3 +473,23 @@ def test_a_rule_without_a_novice_is_refused(capsys):
     with pytest.raises(SystemExit) as ended:
         command(["record", "--expert", "scripted", "--dataset", "toys/rule-v0", "--steps", "5", "--rule", "never"])
     assert ended.value.code == 2 and "--rule never: " in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "harm",
+    [
+        lambda file: file["episode_0"]["actions"].write_direct(np.full((200, 1), np.nan, np.float32)),
+        lambda file: file["episode_0"].pop("actions"),
+        lambda file: file["episode_0"].pop("observations"),
+        lambda file: file["episode_0"].attrs.__setitem__("seed", -5),
+        lambda file: file["episode_0"].attrs.__setitem__("seed", "x"),
+    ],
+    ids=["NaN", "no actions", "no observations", "negative seed", "seed of text"],
+)
+def test_replay_of_damaged_data_ends_with_one_line(capsys, tmp_path, harm):
+    still = lambda observation: np.zeros(1, np.float32)  # noqa: E731
+    damage(record("pendulum/still-v0", still, "Pendulum-v1", 1), harm)
+    with pytest.raises(SystemExit) as ended:
+        command(["replay", "--dataset", "pendulum/still-v0"])
+    error = capsys.readouterr().err.strip()
+    assert ended.value.code == 2 and "pendulum/still-v0" in error and "\n" not in error

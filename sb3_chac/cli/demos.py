@@ -4,7 +4,7 @@ import argparse
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch as th
@@ -24,6 +24,9 @@ from sb3_chac.evaluation import pictures
 from sb3_chac.evaluation.episodes import NotEvaluable, make_env
 from sb3_chac.evaluation.evaluation import saved_model
 from sb3_chac.evaluation.models import DEFAULT_ENV, find_algorithm, find_normalization, load_model
+
+if TYPE_CHECKING:
+    from minari import MinariDataset
 
 DESCRIPTION = """Demonstrations are datasets in Minari's format, see 'minari list local', in the folder MINARI_DATASETS_PATH,
 ~/.minari/datasets if it is not set. A folder may be named in place of an id.
@@ -267,7 +270,21 @@ def run_replay(args: argparse.Namespace) -> None:
     :raises NotEvaluable: if its environment cannot be made, or cannot render
     """
     check_output("--video", args.video, pictures.VIDEO_SUFFIXES)
-    dataset = open_dataset(args.dataset)
+    try:
+        drive_again(args, open_dataset(args.dataset))
+    except (NotEvaluable, DatasetError, OSError):
+        raise
+    except Exception as error:  # whatever damaged data lead to, in Minari, the environment or h5py
+        reason = f"{type(error).__name__}: {error}"
+        raise DatasetError(f"--dataset {args.dataset}: episode {args.episode} cannot be driven again ({reason}).") from error
+
+
+def drive_again(args: argparse.Namespace, dataset: "MinariDataset") -> None:
+    """
+    Repeat the actions of an episode.
+
+    :param dataset: that holds it
+    """
     with Replay(dataset, args.episode, "rgb_array" if args.video else None) as replay:
         if args.video:
             pictures.check_can_render(replay)

@@ -228,7 +228,7 @@ def check_version(folder: Path, name: str) -> None:
 
     try:
         version = json.loads((folder / "metadata.json").read_text())["minari_version"]
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return  # not Minari's, which it says itself
     if version not in supported_dataset_versions:
         raise DatasetError(

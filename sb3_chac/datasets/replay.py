@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from gymnasium import spaces
 
+from sb3_chac.common.checks import is_finite
 from sb3_chac.common.demonstrations import DatasetError
 from sb3_chac.evaluation.episodes import Runner, Task, check_names_no_code, registered_spec
 
@@ -35,6 +36,8 @@ class Replay(Runner):
         if self.metadata.get("seed") is None:
             raise DatasetError(f"{dataset.id} does not hold the seed of episode {number}: it cannot be driven again.")
         self.recorded = dataset[number]
+        if not (is_finite(self.recorded.actions) and is_finite(self.recorded.rewards)):
+            raise DatasetError(f"{dataset.id}: actions or rewards of episode {number} are NaN or infinite.")
         self.observations: list[np.ndarray] = []
         self.rewards: list[float] = []
         spec = registered_spec(spec, f"dataset {dataset.id}")
