@@ -315,12 +315,12 @@ class CHAC(DPVP):
         """Make a gradient step of stage 1 of the paper's Algorithm 1: a human guides."""
         # Z_g by proxy values and rewardless temporal differences; every policy_delay steps pi_g, alpha and all targets
         stats = super()._gradient_step(batch)
-        # Z_c by temporal differences with reward: what pi_g is worth
+        # Z_c by temporal differences with reward: the return of pi_g
         return stats | self._update_confidence_critic(batch)
 
     def _stage_2_step(self, batch: DualReplayBufferSamples) -> dict[str, th.Tensor]:
         """Make a gradient step of stage 2 of the paper's Algorithm 1: shared control. pi_g and Z_g stay as they are."""
-        # Z_c by temporal differences with reward: what is executed is worth
+        # Z_c by temporal differences with reward: the return of what is executed
         stats = self._update_confidence_critic(batch)
         # Every policy_delay steps pi_r, alpha and the targets
         if self._n_updates % self.policy_delay == 0:
