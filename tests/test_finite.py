@@ -10,6 +10,8 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_chac.common.checkpoints import ResumableCheckpoint
+from sb3_chac.evaluation.episodes import NotEvaluable
+from sb3_chac.evaluation.models import find_normalization
 
 # What breaks -> what the message names
 SOURCES = {
@@ -105,20 +107,25 @@ def float64_demonstrations(**columns):
     return demonstrations(**(as_double | {"observation_space": Broken.observation_space} | columns))
 
 
-NORMALIZED = [
-    (name, source) for name in ALL if name not in OFFLINE for source in ("observation", "very first observation", "reward")
-]
+IN_NORMALIZED = ("observation", "very first observation", "first observation", "terminal observation", "reward")
+NORMALIZED = [(name, source) for name in ALL if name not in OFFLINE for source in IN_NORMALIZED]
 
 
+@pytest.mark.parametrize("training", (True, False), ids=("moving", "fixed"))
 @pytest.mark.parametrize("name, source, value", in_turn(NORMALIZED, ("nan", "inf")))
-def test_normalizing_hides_nothing(name, source, value):
-    """Statistics that are not in training clip what is infinite."""
-    env = VecNormalize(DummyVecEnv([lambda: Broken(source, value)]), training=False)
+def test_normalizing_hides_nothing(name, source, value, training):
+    """VecNormalize clips what is infinite, and what is NaN would stay in its statistics for good."""
+    env = VecNormalize(DummyVecEnv([lambda: Broken(source, value)]), training=training)
     kwargs = {"dataset": float64_demonstrations()} if name == "GAIL" else {}
     model = make_any(name, env, **kwargs)
-    with pytest.raises(ValueError, match=SOURCES[source]):
-        model.learn(60)
+    for _ in range(2):  # a second learn() puts no second check around the environments
+        with pytest.raises(ValueError, match=SOURCES[source]):
+            model.learn(60)
+        env.venv.envs[0].unwrapped.count = 0
     assert_finite(model)
+    for statistics in (env.obs_rms, env.ret_rms):
+        assert np.isfinite(statistics.mean).all() and np.isfinite(statistics.var).all()
+    assert env.venv.venv is env.unwrapped
 
 
 LEARN_FROM_DATASETS = [(name, column) for name in (*OFFLINE, "GAIL", *GUIDED) for column in IN_DATASETS]
@@ -151,3 +158,27 @@ def test_no_checkpoint_of_a_model_that_is_not_finite(name, tmp_path):
     with pytest.raises(ValueError, match=r"^model: \S+ is NaN or infinite at step 5: no checkpoint"):
         checkpoint.save()
     assert list(checkpoint.folder.iterdir()) == [kept]
+
+
+def test_no_checkpoint_of_statistics_that_are_not_finite(tmp_path):
+    env = VecNormalize(DummyVecEnv([Walk]))
+    checkpoint = ResumableCheckpoint(1, tmp_path, "Walk")
+    checkpoint.init_callback(make_any("DSAC", env))
+    checkpoint.save()
+    (kept,) = checkpoint.folder.iterdir()
+    env.obs_rms.var[0] = np.nan
+    checkpoint.model.num_timesteps = 5
+    with pytest.raises(
+        ValueError, match=r"^model: vecnormalize.pkl, var of observation is NaN or infinite at step 5: no check"
+    ):
+        checkpoint.save()
+    assert list(checkpoint.folder.iterdir()) == [kept]
+
+
+def test_no_evaluation_with_statistics_that_are_not_finite(tmp_path):
+    env = VecNormalize(DummyVecEnv([Walk]))
+    env.obs_rms.mean[0] = np.inf
+    (tmp_path / "Walk").mkdir()
+    env.save(str(tmp_path / "Walk" / "vecnormalize.pkl"))
+    with pytest.raises(NotEvaluable, match=r"statistics that are NaN or infinite \(vecnormalize.pkl, mean of observation\)"):
+        find_normalization(tmp_path / "model.zip", "Walk", Walk())

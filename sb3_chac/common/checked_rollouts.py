@@ -1,43 +1,15 @@
 """Refuses steps of the environments that are not finite, for the algorithms that learn from rollouts."""
 
-import numpy as np
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.type_aliases import MaybeCallback
-from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
-from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
+from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_chac.common.checks import check_reset, check_step
+from sb3_chac.common.checked_env import CheckedVecEnv, check_what_is_normalized
+from sb3_chac.common.checks import check_finite
 from sb3_chac.common.own_arrays import keep_last_observations
 from sb3_chac.common.utils import detach_distributions
-
-
-class CheckedVecEnv(VecEnvWrapper):
-    """
-    Raises one error for the first observation, reward or cost that is NaN or infinite; gives copies of the actions away.
-
-    :param venv: the environments
-    :param model: that learns in them
-    """
-
-    def __init__(self, venv: VecEnv, model: OnPolicyAlgorithm):
-        super().__init__(venv)
-        self.model = model
-
-    def reset(self) -> VecEnvObs:
-        return self.venv.reset()
-
-    def step_async(self, actions: np.ndarray) -> None:
-        self.venv.step_async(actions.copy())  # what is stored are the actions: the environments may change theirs
-
-    def step_wait(self) -> VecEnvStepReturn:
-        observations, rewards, dones, infos = self.venv.step_wait()
-        check_step(observations, rewards, infos, self.model.num_timesteps)  # type: ignore[arg-type]
-        normalize = self.model.get_vec_normalize_env()
-        if normalize is not None:  # normalizing clips what is infinite
-            check_step(normalize.get_original_obs(), normalize.get_original_reward(), [], self.model.num_timesteps)
-        return observations, rewards, dones, infos
 
 
 class CheckedRollouts(OnPolicyAlgorithm):
@@ -53,8 +25,9 @@ class CheckedRollouts(OnPolicyAlgorithm):
     ) -> tuple[int, BaseCallback]:
         assert self.env is not None
         keep_last_observations(self.env)
+        check_what_is_normalized(self.env, self)
         prepared = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
-        check_reset(self._last_obs, self._vec_normalize_env, self.num_timesteps)  # type: ignore[arg-type]
+        check_finite("observation", self._last_obs, self.num_timesteps)  # type: ignore[arg-type]
         return prepared
 
     def train(self) -> None:

@@ -18,6 +18,7 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.vec_env import VecNormalize
 
 FOLDER = "checkpoints"  # of a run
 CONTENTS = "contents.json"  # of a checkpoint: what was written, to be compared with what is read
@@ -194,16 +195,35 @@ class ResumableCheckpoint(BaseCallback):
 
 def check_finite_model(model: BaseAlgorithm) -> None:
     """
-    Check the parameters of a model.
+    Check the parameters of a model, and the statistics that normalize its observations and rewards.
 
-    :raises ValueError: if a parameter is NaN or infinite; names it
+    :raises ValueError: if one is NaN or infinite; names it
     """
-    for name, values in model.policy.state_dict().items():
-        if not values.isfinite().all():
+    normalize = model.get_vec_normalize_env()
+    numbers = {name: values.cpu().numpy() for name, values in model.policy.state_dict().items()}
+    if normalize is not None:
+        numbers |= statistics(normalize)
+    for name, values in numbers.items():
+        if not np.isfinite(values).all():
             raise ValueError(
                 f"model: {name} is NaN or infinite at step {model.num_timesteps}: no checkpoint was written, the older one is "
                 "kept. Look for values that are too large in observations, rewards and costs, or lower the learning rate."
             )
+
+
+def statistics(normalize: VecNormalize) -> dict[str, np.ndarray]:
+    """
+    Name the statistics of normalized environments.
+
+    :return: means and variances of observations (by key if there are any) and of discounted rewards
+    """
+    of_observations: Any = getattr(normalize, "obs_rms", {})  # none without norm_obs
+    named = of_observations if isinstance(of_observations, dict) else {"observation": of_observations}
+    return {
+        f"vecnormalize.pkl, {part} of {name}": np.asarray(getattr(running, part))
+        for name, running in (named | {"returns": normalize.ret_rms}).items()
+        for part in ("mean", "var")
+    }
 
 
 class SparseWriter(io.BufferedWriter):

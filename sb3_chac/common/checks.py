@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 from gymnasium import spaces
-from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_chac.common.arguments import ends_of_schedule, is_finite_number
 
@@ -150,20 +149,6 @@ def check_step(
         if info.get("terminal_observation") is not None:
             check_finite("terminal observation", info["terminal_observation"], step, env_idx=idx)
         number_in(info, "cost", idx)
-
-
-def check_reset(observations: np.ndarray | dict[str, np.ndarray], normalize: VecNormalize | None, step: int) -> None:
-    """
-    Check that all numbers of first observations are finite.
-
-    :param observations: that episodes begin with, shape (n_envs, ...), or a dictionary of such arrays
-    :param normalize: of the environments, if there is one: normalizing clips what is infinite
-    :param step: total number of steps so far, for the message
-    :raises ValueError: if any is NaN or infinite, normalized or not
-    """
-    check_finite("observation", observations, step)
-    if normalize is not None:
-        check_finite("observation", normalize.get_original_obs(), step)
 
 
 def check_finite(name: str, values: np.ndarray | dict[str, np.ndarray], step: int, env_idx: int | None = None) -> None:

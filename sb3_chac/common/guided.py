@@ -16,7 +16,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_chac.common import contract
 from sb3_chac.common.buffers import DualReplayBuffer
-from sb3_chac.common.checks import check_action_space, check_reset, number_in
+from sb3_chac.common.checks import check_action_space, check_finite, number_in
 from sb3_chac.common.costs import EpisodeCosts, record_costs
 from sb3_chac.common.demonstrations import Dataset, load_demonstrations
 from sb3_chac.common.off_policy_algorithm import CheckedOffPolicyAlgorithm
@@ -250,7 +250,7 @@ class GuidedOffPolicyAlgorithm(CheckedOffPolicyAlgorithm):
         self.replay_buffer.end_trajectories()
         self._forget_episodes()
         self._last_obs = self.env.reset()  # type: ignore[assignment]
-        check_reset(self._last_obs, self._vec_normalize_env, self.num_timesteps)  # type: ignore[arg-type]
+        check_finite("observation", self._last_obs, self.num_timesteps)  # type: ignore[arg-type]
         if self._vec_normalize_env is not None:
             self._last_original_obs = self._vec_normalize_env.get_original_obs()
 

@@ -16,6 +16,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, TensorD
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_chac.common.arguments import check_policy_kwargs
+from sb3_chac.common.checked_env import check_what_is_normalized
 from sb3_chac.common.checks import (
     MismatchedParameters,
     check_action_space,
@@ -23,7 +24,6 @@ from sb3_chac.common.checks import (
     check_integer,
     check_learning_rate,
     check_range,
-    check_reset,
     check_step,
 )
 from sb3_chac.common.own_arrays import keep_last_observations
@@ -81,8 +81,9 @@ class CheckedOffPolicyAlgorithm(OffPolicyAlgorithm):
         assert self.env is not None
         self._check_critics()
         keep_last_observations(self.env)
+        check_what_is_normalized(self.env, self)
         prepared = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
-        check_reset(self._last_obs, self._vec_normalize_env, self.num_timesteps)  # type: ignore[arg-type]
+        check_finite("observation", self._last_obs, self.num_timesteps)  # type: ignore[arg-type]
         return prepared
 
     def _check_critics(self) -> None:
@@ -109,9 +110,6 @@ class CheckedOffPolicyAlgorithm(OffPolicyAlgorithm):
     ) -> None:
         check_finite("action", buffer_action, self.num_timesteps)
         check_step(new_obs, reward, infos, self.num_timesteps)
-        normalize = self._vec_normalize_env
-        if normalize is not None:  # what is stored: normalizing clips what is infinite
-            check_step(normalize.get_original_obs(), normalize.get_original_reward(), [], self.num_timesteps)
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
 
     def set_parameters(

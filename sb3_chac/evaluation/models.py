@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 import torch as th
 from huggingface_sb3 import EnvironmentName
 from rl_zoo3 import utils
@@ -14,6 +15,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
+from sb3_chac.common.checkpoints import statistics
 from sb3_chac.envs import ENVIRONMENTS
 from sb3_chac.envs.driving.corridors import corridors_remedy
 from sb3_chac.evaluation.episodes import NotEvaluable, SavedModel, control_of
@@ -149,12 +151,16 @@ def find_normalization(model: Path, env_id: str, env: gym.Env) -> tuple[Path, Ve
 
     :param env: that the model fits
     :return: where RL-Zoo3 leaves the statistics of a model's observations, and the VecNormalize there, None if there is none
-    :raises NotEvaluable: if the file cannot be read
+    :raises NotEvaluable: if the file cannot be read, or holds numbers that are NaN or infinite
     """
     path = model.parent / EnvironmentName(env_id.rpartition(":")[2]) / "vecnormalize.pkl"
     if not path.is_file():
         return path, None
     try:
-        return path, VecNormalize.load(str(path), DummyVecEnv([lambda: env]))
+        normalize = VecNormalize.load(str(path), DummyVecEnv([lambda: env]))
+        broken = [name for name, values in statistics(normalize).items() if not np.isfinite(values).all()]
     except Exception as error:  # pickle raises nearly anything
         raise NotEvaluable(f"{path} cannot be read: {error}") from error
+    if broken:
+        raise NotEvaluable(f"{path} holds statistics that are NaN or infinite ({broken[0]}): take another checkpoint.")
+    return path, normalize

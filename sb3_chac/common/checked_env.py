@@ -1,0 +1,49 @@
+"""Refuses numbers of the environments that are not finite, before anything is made of them."""
+
+import numpy as np
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
+
+from sb3_chac.common.checks import check_finite, check_step
+
+
+class CheckedVecEnv(VecEnvWrapper):
+    """
+    Raises one error for the first observation, reward or cost that is NaN or infinite; gives copies of the actions away.
+
+    :param venv: the environments
+    :param model: that learns in them, its steps are named in the error
+    """
+
+    def __init__(self, venv: VecEnv, model: BaseAlgorithm):
+        super().__init__(venv)
+        self.model = model
+
+    def reset(self) -> VecEnvObs:
+        observations = self.venv.reset()
+        check_finite("observation", observations, self.model.num_timesteps)  # type: ignore[arg-type]
+        return observations
+
+    def step_async(self, actions: np.ndarray) -> None:
+        self.venv.step_async(actions.copy())  # what is stored are the actions: the environments may change theirs
+
+    def step_wait(self) -> VecEnvStepReturn:
+        observations, rewards, dones, infos = self.venv.step_wait()
+        check_step(observations, rewards, infos, self.model.num_timesteps)  # type: ignore[arg-type]
+        return observations, rewards, dones, infos
+
+
+def check_what_is_normalized(env: VecEnv, model: BaseAlgorithm) -> None:
+    """
+    ``VecNormalize`` clips what is infinite and takes what is NaN into its statistics for good. From now on what it is given
+    is checked before.
+
+    :param env: the environments, nothing is done if they are not normalized
+    :param model: that learns in them
+    """
+    while isinstance(env, VecEnvWrapper):
+        if isinstance(env, VecNormalize):
+            below = env.venv.venv if isinstance(env.venv, CheckedVecEnv) else env.venv
+            env.venv = CheckedVecEnv(below, model)
+        env = env.venv
