@@ -30,7 +30,7 @@ from sb3_chac.common.guided import GuidedOffPolicyAlgorithm
 from sb3_chac.common.lagrange import CostConstrainedAlgorithm
 from sb3_chac.common.offline import OfflineAlgorithm
 from sb3_chac.envs import ENVIRONMENTS, ONE_PER_PROCESS, VALIDATION
-from sb3_chac.human.intervention import ExpertError, RuleError
+from sb3_chac.human.supervisor import ExpertError, RuleError
 from sb3_chac.zoo.algorithms import ALGORITHMS, hyperparams_file
 from sb3_chac.zoo.errors import check_file, check_hyperparameters, check_options, evaluating, one_line
 
