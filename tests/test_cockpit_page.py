@@ -15,8 +15,10 @@ from cockpit_toys import Car, cockpit
 from shell import FOREVER, wait_until
 from test_cockpit_browser import CHROMIUM, NOVICE, Served
 
+from sb3_chac.cockpit import access
 from sb3_chac.cockpit import server as server_module
-from sb3_chac.cockpit.devices.browser import MOMENT, Address, BadMessage, Browser, Held, Wish, parse
+from sb3_chac.cockpit.address import Address
+from sb3_chac.cockpit.devices.browser import MOMENT, BadMessage, Browser, Held, Wish, parse
 from sb3_chac.cockpit.meter import CALM, LEAST, GuidanceMeter
 from sb3_chac.cockpit.session import Display, Novice, asks_for_help, indicators, who_drives
 from sb3_chac.cockpit.wrapper import STANDS
@@ -250,7 +252,7 @@ CHECK = """() => {
 @pytest.fixture
 def served(tmp_path, monkeypatch):
     monkeypatch.setattr(server_module, "HEARTBEAT", None)
-    monkeypatch.setattr(server_module, "PATIENCE", FOREVER)
+    monkeypatch.setattr(access, "PATIENCE", FOREVER)
     monkeypatch.setattr(server_module, "MOST_MESSAGES", 10**9)  # within a second of its clock, which may stand still
     drive = Served(tmp_path)
     yield drive
@@ -276,7 +278,7 @@ def opened(browser, served, **context):
     page = opened.new_page()
     page.on("console", lambda message: complaints.append(message.text) if message.type == "error" else None)
     page.on("pageerror", lambda error: complaints.append(str(error)))
-    page.goto(served.server.url(served.server.driver_token))
+    page.goto(served.server.access.url(served.server.access.driver_token))
     shows(page, "role", "You are at the wheel")
     yield page
     opened.close()
