@@ -115,7 +115,13 @@ def measure(env: str, minutes: float) -> None:
                 drive = run.drive
                 now, heard = time.monotonic(), drive.person.input.time
                 steps.append(
-                    {"time": now, "heard": heard, "lag": drive.lag, "stage": drive.novice.stage, "frames": window.frames}
+                    {
+                        "time": now,
+                        "heard": heard,
+                        "lag": drive.lag,
+                        "stage": drive.display.novice.stage,
+                        "frames": window.frames,
+                    }
                 )
                 return step(action)
 

@@ -151,8 +151,7 @@ class DrivenTraining(Base):
         self._pairs = tuple(
             [*policy.parameters(), *policy.buffers()] for policy in (self._driving_policy, self._learning_policy)
         )
-        drive.show(seconds=self.driven_seconds, total_steps=int(self.counts["total_steps"]))
-        drive.show(human_steps=int(self.counts["human_steps"]))
+        self._show_counts()
         self._tell()
 
     # Two policies and two loggers: each thread has its own
@@ -236,14 +235,18 @@ class DrivenTraining(Base):
         """
         choice = getattr(self.policy, "last_choice", None)
         risk = self._meter.tell(None if actions is None else self._foreseen(actions))
-        self.drive.novice = Novice(
+        novice = Novice(
             self.stage_name,
             None if choice is None else bool(choice.self_drives[0]),
             None if choice is None else float(choice.confidence[0]),
             risk,
             self._meter.asks,
         )
-        self.drive.show(novice=self.drive.novice)
+        self.drive.show(novice=novice)
+
+    def _show_counts(self) -> None:
+        steps = {name: int(self.counts[name]) for name in ("total_steps", "human_steps")}
+        self.drive.count(seconds=self.driven_seconds, **steps)
 
     @th.no_grad()
     def _foreseen(self, actions: np.ndarray) -> float | None:
@@ -287,7 +290,8 @@ class DrivenTraining(Base):
             return
         with self._buffer_lock:
             super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
-        self.driven_seconds = self.drive.display.seconds
+        self.driven_seconds += self.drive.period
+        self._show_counts()
 
     def _setup_learn(
         self,

@@ -125,7 +125,7 @@ class Window:
         self.screen.fill(PANEL)
         if display.picture is not None:
             self._draw_picture(display.picture)
-        self._draw_side(display, drive.lag)
+        self._draw_side(display)
         self._draw_strip(display)
         if drive.notice:
             self._draw_message(drive.notice, ORANGE if drive.paused or drive.busy or drive.ended else RED)
@@ -151,13 +151,13 @@ class Window:
         surface = self._picture[1]
         self.screen.blit(surface, surface.get_rect(center=PICTURE.center))
 
-    def _draw_side(self, display: Display, lag: int) -> None:
-        is_manned = self.drive.person.read().connected
+    def _draw_side(self, display: Display) -> None:
+        is_manned, lag = self.drive.person.read().connected, self.drive.lag
         driver = who_drives(display, is_manned)
         colour_of_driver = COLOURS[driver]
         pygame.draw.rect(self.screen, colour_of_driver, (SIDE.left, 0, 6, SIDE.height))
         y = 24
-        for name, value in indicators(display, lag, is_manned):
+        for name, value in indicators(display, self.drive.totals, lag, is_manned):
             colour = TEXT
             if name == "takeover" and colour_of_driver != EGO:
                 colour = colour_of_driver
