@@ -31,7 +31,7 @@ from sb3_chac.cockpit.devices import (
     save_config,
 )
 from sb3_chac.cockpit.devices.emulator import DeviceEmulator
-from sb3_chac.cockpit.learner import driven
+from sb3_chac.cockpit.driven import driven
 from sb3_chac.cockpit.person import NotDrivable, Person, check_drivable
 from sb3_chac.cockpit.recording import FOLDER
 from sb3_chac.cockpit.session import SessionEnded

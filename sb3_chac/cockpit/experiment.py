@@ -14,7 +14,7 @@ from rl_zoo3.utils import ALGOS
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_chac.cockpit.devices import Device
-from sb3_chac.cockpit.learner import DrivenTraining, driven
+from sb3_chac.cockpit.driven import DrivenTraining, driven
 from sb3_chac.cockpit.person import NotDrivable, Person, check_drivable
 from sb3_chac.cockpit.recording import CrashSafeRecorder, Summary
 from sb3_chac.cockpit.session import Session
