@@ -36,7 +36,7 @@ from sb3_chac.cockpit.person import NotDrivable, Person, check_drivable
 from sb3_chac.cockpit.recording import FOLDER
 from sb3_chac.cockpit.session import SessionEnded
 from sb3_chac.cockpit.window import Window
-from sb3_chac.common.checkpoints import sound_checkpoint
+from sb3_chac.common.checkpoint_files import sound_checkpoint
 from sb3_chac.common.demonstrations import load_demonstrations
 
 

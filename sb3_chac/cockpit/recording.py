@@ -1,7 +1,6 @@
 """What was driven, as a dataset in Minari's format and a summary. Each episode is on the disk as soon as it ends."""
 
 import json
-import os
 import shutil
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -11,8 +10,9 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.envs.registration import EnvSpec
 
-from sb3_chac.common.checkpoints import sync
-from sb3_chac.common.demonstrations import DatasetError, check_spaces
+from sb3_chac.common.demonstrations import check_spaces
+from sb3_chac.common.files import sync, write_safely
+from sb3_chac.common.minari_datasets import DatasetError
 from sb3_chac.datasets.recording import Recorder as EpisodeRecorder
 from sb3_chac.datasets.writer import DatasetWriter, folder_to_make, storable_spec
 
@@ -253,15 +253,3 @@ def _summary(episodes: list[dict[str, np.ndarray]], dataset: Path | None, second
         successes=sum(bool(episode["info/is_success"][-1]) for episode in episodes) if tell_success else None,
         seconds=steps * seconds_per_step,
     )
-
-
-def write_safely(file: Path, content: bytes) -> None:
-    """
-    Replace a file in one go.
-
-    :param file: holds what it held before, or all of ``content``, whenever the process is killed
-    """
-    temporary = file.with_name(file.name + ".tmp")
-    temporary.write_bytes(content)
-    sync(temporary)
-    os.replace(temporary, file)

@@ -1,10 +1,8 @@
 """Demonstrations: datasets in Minari's format (minari.farama.org) as flat arrays. ``datasets.recording`` makes some."""
 
-import json
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias, Union
 
 import numpy as np
@@ -14,6 +12,7 @@ from stable_baselines3.common.vec_env import VecTransposeImage
 
 from sb3_chac.common.checks import is_finite
 from sb3_chac.common.contract import NOVICE_ACTION, TAKEOVER
+from sb3_chac.common.minari_datasets import HOW_TO_GET_ONE, DatasetError, damaged, is_minari_dataset, open_dataset
 
 if TYPE_CHECKING:
     from minari import MinariDataset
@@ -26,16 +25,8 @@ Dataset: TypeAlias = Union[
     "MinariDataset",
     Sequence[Union[str, os.PathLike[str], "Demonstrations", "MinariDataset"]],
 ]
-HOW_TO_GET_ONE = (
-    "Record one with 'python -m sb3_chac demos record', fetch one with 'minari download', or list those that are there with "
-    "'minari list local'."
-)
 # Names in the infos of a recording -> fields of Demonstrations. An action's info is stored at the index of what follows it
 INFOS = {TAKEOVER: "takeovers", NOVICE_ACTION: "novice_actions", "cost": "costs", "is_success": "successes"}
-
-
-class DatasetError(ValueError):
-    """Raised for a dataset that is missing, damaged, empty or made for other spaces; says what is wrong and what to do."""
 
 
 def missing_dataset(algorithm: str) -> DatasetError:
@@ -124,7 +115,7 @@ def load_demonstrations(
         try:
             demonstrations = _read(opened)
         except Exception as error:  # h5py raises nearly anything, numpy for shapes that do not fit together
-            raise _damaged(name, error) from error
+            raise damaged(name, error) from error
     else:
         raise DatasetError(
             f"dataset: must be the id or folder of a dataset, a MinariDataset, Demonstrations or a list, got {dataset!r}."
@@ -176,111 +167,6 @@ def joined(parts: Sequence[Demonstrations]) -> Demonstrations:
         if field.name not in ("observation_space", "action_space", "episodes"):
             columns[field.name] = None if any(value is None for value in values) else np.concatenate(values)
     return replace(first, episodes=np.concatenate(episodes), **columns)
-
-
-def is_minari_dataset(dataset: Any) -> bool:
-    """
-    Tell Minari's datasets from others, without importing Minari.
-
-    :return: whether it is a ``MinariDataset``
-    """
-    from minari import MinariDataset
-
-    return isinstance(dataset, MinariDataset)
-
-
-def open_dataset(dataset: "str | os.PathLike[str] | MinariDataset") -> "MinariDataset":
-    """
-    Open a dataset with Minari.
-
-    :param dataset: id of a local dataset of Minari, its folder, or what was opened before
-    :raises DatasetError: if it is missing, damaged, empty, or made by a version of Minari that the installed one cannot read
-    """
-    from minari import MinariDataset
-
-    if isinstance(dataset, MinariDataset):
-        opened, name = dataset, f"dataset {dataset.id!r}"
-    else:
-        folder, name = find_dataset(dataset), f"dataset {os.fspath(dataset)!r}"
-        check_version(folder, name)
-        try:
-            opened = MinariDataset(folder)
-        except Exception as error:  # whatever a damaged file leads to
-            raise _damaged(name, error) from error
-    try:
-        empty = len(opened.episode_indices) == 0 or opened.total_steps == 0
-    except Exception as error:
-        raise _damaged(name, error) from error
-    if empty:
-        raise DatasetError(f"{name} holds no steps. {HOW_TO_GET_ONE}")
-    return opened
-
-
-def check_version(folder: Path, name: str) -> None:
-    """
-    Check that Minari can read a dataset.
-
-    :param folder: that holds the data
-    :param name: of the dataset, for the message
-    :raises DatasetError: if the installed Minari cannot read what another version has written
-    """
-    from minari import __version__, supported_dataset_versions
-
-    try:
-        version = json.loads((folder / "metadata.json").read_text())["minari_version"]
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
-        return  # not Minari's, which it says itself
-    if version not in supported_dataset_versions:
-        raise DatasetError(
-            f"{name} was made by Minari {version}, which the installed Minari {__version__} cannot read (only "
-            f"{', '.join(sorted(supported_dataset_versions))}). Install a version that can (pip install minari=={version}), "
-            "or record or download the dataset anew."
-        )
-
-
-def find_dataset(dataset: str | os.PathLike[str]) -> Path:
-    """
-    Find the folder of a dataset.
-
-    :param dataset: id of a local dataset of Minari, or its folder
-    :return: the folder that holds the data
-    :raises DatasetError: if there is none
-    """
-    name = os.fspath(dataset)
-    candidates = [Path(name)]
-    if is_dataset_id(name):
-        candidates.insert(0, minari_folder() / name)
-    for candidate in candidates:
-        if (candidate / "data").is_dir():
-            return candidate / "data"
-        if (candidate / "metadata.json").is_file():
-            return candidate
-    looked_for = " or ".join(str(candidate) for candidate in candidates)
-    raise DatasetError(f"There is no dataset {name!r} (looked for {looked_for}). {HOW_TO_GET_ONE}")
-
-
-def minari_folder() -> Path:
-    """
-    Return Minari's folder of datasets, which need not exist yet.
-
-    :return: where Minari keeps its datasets. It need not exist yet
-    """
-    return Path(os.environ.get("MINARI_DATASETS_PATH") or Path.home() / ".minari" / "datasets")
-
-
-def is_dataset_id(name: str) -> bool:
-    """
-    Tell whether a name is an id of Minari.
-
-    :return: whether it is an id such as "safedrive/scripted-v0", with a version at its end
-    """
-    from minari.dataset.minari_dataset import parse_dataset_id
-
-    try:
-        parse_dataset_id(name)
-    except (ValueError, TypeError):  # malformed, without a version
-        return False
-    return True
 
 
 def check_spaces(observation_space: spaces.Space, action_space: spaces.Space) -> None:
@@ -390,10 +276,10 @@ def _check_arrays(demonstrations: Demonstrations, name: str) -> None:
         if values is None:
             continue
         if values.shape != shape:
-            raise _damaged(name, f"{field} have shape {values.shape} instead of {shape}")
+            raise damaged(name, f"{field} have shape {values.shape} instead of {shape}")
         if not is_finite(values):
             step = next(step for step in range(steps) if not is_finite(values[step]))
-            raise _damaged(name, f"{field} are NaN or infinite at step {step}")
+            raise damaged(name, f"{field} are NaN or infinite at step {step}")
     if isinstance(action_space, spaces.Discrete):
         low, high = np.array(action_space.start), np.array(action_space.start + action_space.n - 1)
     else:
@@ -420,11 +306,4 @@ def _channels_first(demonstrations: Demonstrations) -> Demonstrations:
         observation_space=VecTransposeImage.transpose_space(demonstrations.observation_space),
         observations=np.moveaxis(demonstrations.observations, -1, 1),
         next_observations=np.moveaxis(demonstrations.next_observations, -1, 1),
-    )
-
-
-def _damaged(name: str, problem: object) -> DatasetError:
-    return DatasetError(
-        f"{name}: the dataset cannot be used, it is damaged or not Minari's: {str(problem) or type(problem).__name__}. "
-        "Restore it from a copy, or record it anew with 'python -m sb3_chac demos record --overwrite'."
     )

@@ -32,7 +32,8 @@ from sb3_chac.common.contract import (
     read_report,
     scaled,
 )
-from sb3_chac.common.demonstrations import DatasetError, check_spaces
+from sb3_chac.common.demonstrations import check_spaces
+from sb3_chac.common.minari_datasets import DatasetError
 from sb3_chac.datasets.writer import DatasetWriter, folder_to_make
 from sb3_chac.evaluation.episodes import Runner, SavedModel, Task, make_env
 from sb3_chac.evaluation.evaluation import policy_name, saved_model, scenario_list

@@ -11,7 +11,7 @@ import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec
 
 import sb3_chac
-from sb3_chac.common.demonstrations import DatasetError, is_dataset_id, minari_folder
+from sb3_chac.common.minari_datasets import DatasetError, is_dataset_id, minari_folder
 from sb3_chac.human.intervention import InterventionWrapper
 
 if TYPE_CHECKING:

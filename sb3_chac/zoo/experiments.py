@@ -17,15 +17,8 @@ from stable_baselines3.common.callbacks import ProgressBarCallback
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
 from sb3_chac.common.callbacks import PROGRESS_FILE, CSVProgress, GuidedProgressBar, SafetyCost
-from sb3_chac.common.checkpoints import (
-    DamagedCheckpoint,
-    ResumableCheckpoint,
-    StopSignals,
-    TrainingStopped,
-    checkpoint_step,
-    stored_rows,
-    verify,
-)
+from sb3_chac.common.checkpoint_files import DamagedCheckpoint, checkpoint_step, stored_rows, verify
+from sb3_chac.common.checkpoints import ResumableCheckpoint, StopSignals, TrainingStopped
 from sb3_chac.common.guided import GuidedOffPolicyAlgorithm
 from sb3_chac.common.lagrange import CostConstrainedAlgorithm
 from sb3_chac.common.offline import OfflineAlgorithm
