@@ -193,7 +193,7 @@ def check_numbers(args: argparse.Namespace) -> None:
 
 def check_arguments(args: argparse.Namespace) -> None:
     """
-    Also fills in what was left open.
+    Check the command line, and fill in what was left open.
 
     :raises NotDrivable: for what does not fit
     """

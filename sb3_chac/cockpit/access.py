@@ -1,4 +1,4 @@
-"""Who may connect to the cockpit's server: access tokens, host names, origins, and limits for everybody."""
+"""Access to the cockpit's server: access tokens, host names, origins, and limits for everybody."""
 
 import asyncio
 import hmac
@@ -37,7 +37,7 @@ POLICY = (
 
 class Counter:
     """
-    How much one viewer, or one address, asks for: too much if it is more than ``most`` within a second.
+    Count of what one viewer, or one address, asks for: too much if it is more than ``most`` within a second.
 
     :param most: number of requests or messages
     :param clock: [s]
@@ -48,7 +48,7 @@ class Counter:
         self._second, self._count = 0.0, 0
 
     def is_flooded(self) -> bool:
-        """To be called once for each."""
+        """Count one more, and tell whether that is too many."""
         now = self.clock()
         if now - self._second > 1:
             self._second, self._count = now, 0
@@ -58,7 +58,7 @@ class Counter:
 
 class Access:
     """
-    Gatekeeper of the server: decides who may come in.
+    Gatekeeper of the server.
 
     There are two access tokens, one for who may drive and one for who may watch. Nobody gets anything without one, on loopback
     neither, for others may use the machine. Requests under other host names (DNS rebinding) and WebSockets of other origins
@@ -81,6 +81,7 @@ class Access:
     async def guard(
         self, request: web.Request, handler: Callable[[web.Request], Awaitable[web.StreamResponse]]
     ) -> web.StreamResponse:
+        """Answer a request, unless it is refused, with the headers that hold for every answer."""
         self._useful.add(request.protocol)
         try:
             self._check_request(request)
@@ -96,7 +97,7 @@ class Access:
 
     def _check_request(self, request: web.Request) -> None:
         """
-        What holds for everybody, whether there is a token or not.
+        Check what holds for everybody, whether there is a token or not.
 
         :raises HTTPException: for too many requests of an address, and for another host name
         """
@@ -121,6 +122,7 @@ class Access:
 
     @property
     def scheme(self) -> str:
+        """Scheme of the page's address."""
         return "https" if self.tls else "http"
 
     def url(self, token: str) -> str:
@@ -162,7 +164,7 @@ class Access:
         return http() if len(http.connections) < MOST_CONNECTIONS else _Refusal()
 
     async def sweep(self, http: web.Server) -> None:
-        """Closes connections that ask for nothing, so that they do not keep others out."""
+        """Close connections that ask for nothing, so that they do not keep others out."""
         seen: dict[Any, float] = {}
         while True:
             await asyncio.sleep(self.patience / 4)

@@ -1,4 +1,4 @@
-"""Where the cockpit is served."""
+"""Addresses at which the cockpit is served."""
 
 import ipaddress
 import socket
@@ -7,13 +7,14 @@ from typing import NamedTuple
 
 
 class Address(NamedTuple):
-    """Where the cockpit is served."""
+    """Host and port at which the cockpit is served."""
 
     host: str
     port: int
 
     @property
     def is_loopback(self) -> bool:
+        """Tell whether only this machine can reach it."""
         return self.host == "localhost" or (is_number(self.host) and ipaddress.ip_address(self.host).is_loopback)
 
     def from_elsewhere(self) -> "Address":
@@ -34,6 +35,12 @@ class Address(NamedTuple):
         return Address(own, self.port)
 
     def url(self, token: str, scheme: str = "http") -> str:
+        """
+        Build the address of the page.
+
+        :param token: of who opens it
+        :param scheme: "http" or "https"
+        """
         host = f"[{self.host}]" if ":" in self.host else self.host
         return f"{scheme}://{host}:{self.port}/?token={token}"
 

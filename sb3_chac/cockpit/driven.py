@@ -32,7 +32,7 @@ LOW = -1.2816  # the 10 % quantile of the normal distribution
 
 class DrivenTraining(Base):
     """
-    Makes an algorithm fit for a drive: see ``driven``.
+    Base of the algorithms of a drive, see ``driven``.
 
     ``train`` only says how many gradient steps are due; a ``Learner`` makes them. Who drives is a copy of the policy, brought
     up to date after each gradient step, so that no step of the environment waits for one. What takes long and is to
@@ -46,7 +46,7 @@ class DrivenTraining(Base):
 
     def attach(self, drive: Session) -> None:
         """
-        To be called before ``learn``.
+        Prepare for a drive; to be called before ``learn``.
 
         :param drive: in whose environment it learns
         :raises ValueError: for what cannot be done in a drive
@@ -93,7 +93,7 @@ class DrivenTraining(Base):
 
     @th.no_grad()
     def refresh_driver(self) -> None:
-        """The driving policy becomes what was learned."""
+        """Make the driving policy what was learned."""
         with self._driving_lock:
             th._foreach_copy_(self._pairs[0], self._pairs[1])
 
@@ -104,12 +104,12 @@ class DrivenTraining(Base):
         self.drive.lag = self.owed_steps
 
     def train_now(self, gradient_steps: int, batch_size: int) -> None:
-        """The algorithm's own ``train``."""
+        """Call the algorithm's own ``train``."""
         super().train(gradient_steps, batch_size)
 
     def pretrain(self, gradient_steps: int) -> None:
         """
-        Gradient steps on what the replay buffer holds, before the drive begins.
+        Make gradient steps on what the replay buffer holds, before the drive begins.
 
         :param gradient_steps: number
         """
@@ -126,6 +126,7 @@ class DrivenTraining(Base):
 
     @property
     def stage_name(self) -> str:
+        """Stage of the training, for the display."""
         return "guided"
 
     def _sample_action(
@@ -142,7 +143,7 @@ class DrivenTraining(Base):
 
     def _tell(self, actions: np.ndarray | None = None) -> None:
         """
-        What the display shows of the novice.
+        Tell the display about the novice.
 
         :param actions: that it is about to do, scaled to [-1, 1], shape (1, 2)
         """
@@ -223,7 +224,7 @@ class DrivenTraining(Base):
 
     def learn(self, *args: Any, **kwargs: Any) -> Any:
         """
-        As the algorithm's, but it returns early when the person quits. Everything driven is stored then.
+        Learn as the algorithm does, but return early when the person quits. Everything driven is stored then.
         """
         try:
             super().learn(*args, **kwargs)
@@ -241,7 +242,7 @@ class DrivenTraining(Base):
         return [*super()._excluded_save_params(), *own, "_pairs", "_learning_policy", "_callback"]
 
     def save(self, *args: Any, **kwargs: Any) -> None:
-        """As SB3's, between two gradient steps."""
+        """Save as SB3 does, between two gradient steps."""
         with self.learner.resting():
             super().save(*args, **kwargs)
 
@@ -266,7 +267,7 @@ class DrivenStages(DrivenTraining):
             self.prefit_left -= 1
 
     def _start_stage_2(self) -> None:
-        """Is called after each step of the environment as long as it is due."""
+        """Prepare stage 2; called after each step of the environment as long as it is due."""
         if self.prefit_left is None:
             self.steps_before_prefit, self.prefit_left = self.owed_steps, self.prefit_steps  # type: ignore[attr-defined]
             self.learner.owe(self.prefit_steps)  # type: ignore[attr-defined]

@@ -29,7 +29,7 @@ DEFAULT_RATE = 10.0  # [1/s]
 
 class EpisodeCheckpoint(ResumableCheckpoint):
     """
-    Writes them at the beginning of an episode, when nobody is driving at speed.
+    Checkpoints at the beginnings of episodes, when nobody is driving at speed.
 
     :param cockpit: tells when that is
     """
@@ -106,6 +106,7 @@ class CockpitRun:
 
     @property
     def is_over(self) -> bool:
+        """Tell whether the driving thread has ended."""
         return not self.thread.is_alive()
 
     def _run(self) -> None:

@@ -14,8 +14,8 @@ if TYPE_CHECKING:
 
 class Learner(threading.Thread):
     """
-    Makes the gradient steps that a model owes, in their order and number, one at a time. It leaves the moment of the next
-    step of the environment to the driver.
+    Thread that makes the gradient steps that a model owes, in their order and number, one at a time. It leaves the moment of
+    the next step of the environment to the driver.
 
     :param model: that learns
     :param drive: beside which it learns
@@ -44,7 +44,7 @@ class Learner(threading.Thread):
 
     def drain(self) -> None:
         """
-        Returns when nothing is owed.
+        Wait until nothing is owed.
 
         :raises BaseException: what a gradient step has raised
         """
@@ -55,12 +55,12 @@ class Learner(threading.Thread):
 
     @contextmanager
     def resting(self) -> Iterator[None]:
-        """The networks do not change inside the block."""
+        """Keep the networks as they are inside the block."""
         with self._working:
             yield
 
     def stop(self) -> None:
-        """Returns when the gradient step that is under way is made. What is owed stays so."""
+        """Stop once the gradient step that is under way is made. What is owed stays so."""
         with self._changed:
             self._stopped = True
             self._changed.notify_all()

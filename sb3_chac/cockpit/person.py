@@ -34,7 +34,7 @@ def check_drivable(env: gym.Env) -> None:
 
 class Person:
     """
-    Turns what a device says into actions. ``InterventionWrapper`` takes it as its expert and ``drives`` as its rule. Events
+    Person whose device says what to do. ``InterventionWrapper`` takes it as its expert and ``drives`` as its rule. Events
     come from the thread of the window or the server, ``look`` from the one that drives.
 
     :param device: that the person holds
@@ -66,17 +66,17 @@ class Person:
             return self.device.handle(event)
 
     def look(self) -> DriverInput:
-        """What the person wants in the step that is about to be made."""
+        """Note and return what the person wants in the step that is about to be made."""
         self.input = self.read()
         return self.input
 
     def read(self) -> DriverInput:
-        """What the person wants now."""
+        """Return what the person wants now."""
         with self.lock:
             return self.device.read()
 
     def hand_back(self) -> None:
-        """Ends the takeover, if there is one."""
+        """End the takeover, if there is one."""
         with self.lock:
             self.device.hand_back()
 

@@ -55,7 +55,7 @@ class Viewer:
 
 class Server:
     """
-    Serves the cockpit of a drive.
+    Server of the cockpit of a drive.
 
     Who may come in, ``Access`` decides; messages that the page does not send are refused. One viewer sits at the wheel; it
     becomes free when that one leaves, and is taken by a click then, not by itself.
@@ -85,7 +85,7 @@ class Server:
     @asynccontextmanager
     async def listening(self) -> AsyncIterator[None]:
         """
-        Serves inside the block.
+        Serve inside the block.
 
         :raises OSError: if the address cannot be had
         """
@@ -156,7 +156,7 @@ class Server:
         return channel
 
     def _sit_down(self, viewer: Viewer) -> None:
-        """Nobody gets the wheel of a takeover that another one has begun: first it brakes."""
+        """Take the wheel if it is free. A takeover in progress is never transferred: the vehicle brakes first."""
         if viewer.may_drive and self.driver is None and not self.drive.person.read().takeover:
             self.driver = viewer
             with self.drive.person.lock:
@@ -195,7 +195,7 @@ class Server:
     # What they are told
 
     async def _publish(self) -> None:
-        """Wakes the viewers when there is something new, and every ``TELL`` anyway."""
+        """Wake the viewers when there is something new, and every ``TELL`` anyway."""
         told = time.monotonic()
         while True:
             with suppress(asyncio.TimeoutError):
@@ -211,7 +211,7 @@ class Server:
                     viewer.news.set()
 
     async def _tell(self, viewer: Viewer) -> None:
-        """Sends the newest state and picture, as fast as the viewer takes them: who is slow gets fewer."""
+        """Send the newest state and picture, as fast as the viewer takes them: who is slow gets fewer."""
         with suppress(ConnectionError):
             while not viewer.socket.closed:
                 await viewer.news.wait()
@@ -303,7 +303,7 @@ async def serve(
     tls: ssl.SSLContext | None = None,
 ) -> None:
     """
-    Serves the cockpit until the drive is over. SIGINT and SIGTERM end it as the person's quit does.
+    Serve the cockpit until the drive is over. SIGINT and SIGTERM end it as the person's quit does.
 
     :param drive: with ``device`` at its wheel
     :param device: of the driver

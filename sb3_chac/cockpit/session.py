@@ -1,4 +1,4 @@
-"""What the threads of a drive share: the clock of the steps, pause and quit, and what there is to be seen."""
+"""Session state shared by the UI, driving and learner threads: clock, pause, quit, what is displayed, and totals."""
 
 import threading
 import time
@@ -20,7 +20,7 @@ class SessionEnded(Exception):
 @dataclass(frozen=True)
 class Novice:
     """
-    What the learning driver says of itself.
+    State of the novice, as it tells it.
 
     :param stage: of the training, to read
     :param self_drives: C-HAC in stage 2: whether the self-learning policy acts
@@ -39,7 +39,7 @@ class Novice:
 @dataclass(frozen=True)
 class Display:
     """
-    What the cockpit shows of the last step.
+    Picture and numbers of the last step.
 
     :param picture: of the environment, shape (height, width, 3), uint8
     :param number: of the picture
@@ -85,6 +85,7 @@ class Totals:
 
     @property
     def takeover_rate(self) -> float:
+        """Share of the steps that the person drove."""
         return self.human_steps / self.total_steps if self.total_steps else 0.0
 
 
@@ -125,7 +126,7 @@ class Session:
             self._changed.notify_all()
 
     def go_on(self) -> None:
-        """Ends a pause, unless there is nothing to take over with."""
+        """End a pause, unless there is nothing to take over with."""
         if not self.person.read().connected:
             self.pause(lost_message(self.person.device.name))
             return
@@ -134,17 +135,17 @@ class Session:
             self._changed.notify_all()
 
     def toggle_pause(self) -> None:
-        """Pauses, or goes on."""
+        """Pause, or go on."""
         self.go_on() if self.paused else self.pause()
 
     def skip(self) -> None:
-        """The next step is the last of the episode. If it is paused, the next episode waits."""
+        """Make the next step the last of the episode. If it is paused, the next episode waits."""
         with self._changed:
             self._skip = True
             self._changed.notify_all()
 
     def quit(self) -> None:
-        """Ends the drive before its next step."""
+        """End the drive before its next step."""
         with self._changed:
             self.ended = True
             self._changed.notify_all()
@@ -165,14 +166,14 @@ class Session:
 
     @property
     def notice(self) -> str:
-        """What the person is to be told, "" for nothing."""
+        """Message to the person, "" for none."""
         return "Saving: please wait" if self.ended else self.busy or self.message
 
     # For the driving thread
 
     def wait_for_tick(self) -> None:
         """
-        Returns when the next step is due, ``period`` after the last one at the earliest; in a pause, when it is over.
+        Wait until the next step is due, ``period`` after the last one at the earliest; in a pause, when it is over.
 
         :raises SessionEnded: if the person has quit
         """
@@ -229,7 +230,7 @@ class Session:
 
     def wait_for_room(self, seconds: float) -> None:
         """
-        Keeps the moment of the next step free: returns when there are ``seconds`` before it, or the step is under way.
+        Keep the moment of the next step free: wait until there are ``seconds`` before it, or the step is under way.
 
         :param seconds: [s] that are needed; with more than most of a period there is no point in waiting
         """

@@ -46,7 +46,7 @@ HELP = (
 
 class Window:
     """
-    Opens a window. Events are handed on as they come, whatever is being drawn otherwise waits.
+    Window of the cockpit. Events are handed on as they come, whatever is being drawn otherwise waits.
 
     :param title: of the window
     :raises RuntimeError: if no window can be opened
@@ -94,6 +94,7 @@ class Window:
                 self.handle(event)
 
     def close(self) -> None:
+        """Close the window."""
         pygame.display.quit()
 
     def handle(self, event: Any) -> None:
@@ -120,7 +121,7 @@ class Window:
     # What is drawn
 
     def draw(self) -> None:
-        """One frame."""
+        """Draw one frame."""
         drive, display = self.drive, self.drive.display
         self.screen.fill(PANEL)
         if display.picture is not None:

@@ -104,7 +104,7 @@ class Cockpit(gym.Wrapper):
 
     def _has_collided(self, info: dict[str, Any]) -> bool:
         """
-        Whether a collision has begun; environments report one by ``collision``, or by ``crashed`` for as long as it lasts.
+        Tell whether a collision has begun. Environments report one by ``collision``, or by ``crashed`` while it lasts.
 
         :param info: of a step
         :return: whether one has begun in it

@@ -69,7 +69,7 @@ def sound_checkpoint(folder: Path) -> tuple[Path | None, list[str]]:
 
 def verify(folder: Path) -> None:
     """
-    Reads a checkpoint and compares it with what was written.
+    Read a checkpoint and compare it with what was written.
 
     :param folder: of the checkpoint
     :raises DamagedCheckpoint: if a file is missing or damaged, or a weight is not finite

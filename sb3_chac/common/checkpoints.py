@@ -66,8 +66,8 @@ class TrainingStopped(BaseException):
 
 class ResumableCheckpoint(BaseCallback):
     """
-    Keeps the newest state of a training in ``<run folder>/checkpoints/<number of steps>``: the model, its replay buffer and
-    the running statistics of ``VecNormalize``, named as RL-Zoo3's ``-i`` expects them.
+    Keeper of the newest state of a training in ``<run folder>/checkpoints/<number of steps>``: the model, its replay buffer
+    and the running statistics of ``VecNormalize``, named as RL-Zoo3's ``-i`` expects them.
 
     It is written between two rollouts, when everything collected is stored and learned from, and after the last one. The
     folder is filled under another name, read back, and renamed once it is on the disk: whenever the process is killed, a
@@ -134,7 +134,7 @@ class ResumableCheckpoint(BaseCallback):
         return f"Stopped by {reason} at step {step}; go on{loss}: sb3-chac resume {self.folder.parent}"
 
     def save(self) -> None:
-        """Writes a checkpoint and removes all but it and the one before it."""
+        """Write a checkpoint and remove all but it and the one before it."""
         step = self.model.num_timesteps
         self.due_at = step + self.save_freq
         final = self.folder / str(step)

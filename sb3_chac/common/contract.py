@@ -29,7 +29,7 @@ TOLERANCE = 1e-4  # of actions scaled to [-1, 1], for rounding
 
 class Report(NamedTuple):
     """
-    What ``info`` says of one step.
+    Report of ``info`` on one step.
 
     :param takeover: whether the human acted
     :param action: what was executed, if the human acted, in the units of the environment that reports it
@@ -43,7 +43,7 @@ class Report(NamedTuple):
 
 def read_report(info: dict[str, Any], action_space: spaces.Space, env_idx: int = 0) -> Report:
     """
-    The flag decides; only where there is none does the presence of an action. None is as good as not there.
+    Read who acted. The flag decides; only where there is none does the presence of an action. None is as good as not there.
 
     :param info: of one step
     :param action_space: of the actions
@@ -190,7 +190,7 @@ class _ActionWrapperAboveTakeover(type):
 
 
 class ActionWrapperAboveTakeover(metaclass=_ActionWrapperAboveTakeover):
-    """What is an instance of this class changes actions on their way to a ``TakeoverWrapper`` below."""
+    """Class of all wrappers that change actions on their way to a ``TakeoverWrapper`` below."""
 
 
 def action_wrapper_above_report(env: gym.Env) -> gym.Wrapper | None:

@@ -45,8 +45,7 @@ def missing_dataset(algorithm: str) -> DatasetError:
 @dataclass(frozen=True, eq=False)
 class Demonstrations:
     """
-    What somebody did in an environment, step after step: n steps of all episodes, in their order. The dtypes are those of the
-    recording.
+    Flat arrays of demonstrated transitions: n steps of all episodes, in their order. The dtypes are those of the recording.
 
     :param observation_space: of the observations, a Box
     :param action_space: of the actions, a Box or Discrete
@@ -82,7 +81,7 @@ class Demonstrations:
 
     @property
     def ends(self) -> np.ndarray:
-        """Whether a step is the last one of its episode, whatever its flags say, shape (n,)."""
+        """Ends of episodes: whether a step is the last one of its episode, whatever its flags say, shape (n,)."""
         return self.terminations | self.truncations | (np.diff(self.episodes, append=self.episodes[-1:] + 1) != 0)
 
 
@@ -299,7 +298,7 @@ def _check_arrays(demonstrations: Demonstrations, name: str) -> None:
 
 
 def _channels_first(demonstrations: Demonstrations) -> Demonstrations:
-    """As SB3's models see images: it transposes those of environments itself."""
+    """Transpose images as SB3's models see them."""
     assert isinstance(demonstrations.observation_space, spaces.Box)
     return replace(
         demonstrations,

@@ -1,4 +1,4 @@
-"""What the algorithms that learn from takeovers share: asking the human, storing who drove, counting."""
+"""Base class for algorithms that learn from takeovers: asking the human, storing who drove, counting."""
 
 import io
 import pathlib
@@ -78,7 +78,7 @@ class GuidedOffPolicyAlgorithm(CheckedOffPolicyAlgorithm):
 
     def store_demonstrations(self, dataset: Dataset) -> None:
         """
-        Puts a dataset into the replay buffer, as if it had been driven: what the human drove (all of it, if the dataset does
+        Put a dataset into the replay buffer, as if it had been driven: what the human drove (all of it, if the dataset does
         not say who drove) beside what the novice proposed, and the rest. It is not counted as steps of this training.
 
         :param dataset: see ``load_demonstrations``
@@ -127,7 +127,7 @@ class GuidedOffPolicyAlgorithm(CheckedOffPolicyAlgorithm):
         return self.counts["safety_cost"] if "safety_cost" in self.measured else None
 
     def _needs_human(self) -> bool:
-        """Whether the human is asked in this stage of the training."""
+        """Tell whether the human is asked in this stage of the training."""
         return True
 
     def _setup_learn(
@@ -177,7 +177,7 @@ class GuidedOffPolicyAlgorithm(CheckedOffPolicyAlgorithm):
         return self
 
     def _prepare_wrappers(self) -> None:
-        """Wrappers that are new go on with the counts of those before them."""
+        """Let wrappers that are new go on with the counts of those before them."""
         if not self._wrapped:
             return
         if self.wrapper_states and len(self.wrapper_states) != self.n_envs:  # deal out the sums
@@ -214,8 +214,8 @@ class GuidedOffPolicyAlgorithm(CheckedOffPolicyAlgorithm):
 
     def _begin_step(self) -> None:
         """
-        The next step of the environments is one of the training. If somebody else has been in them since the last one (an
-        evaluation in the training environment), new episodes begin.
+        Announce that the next step of the environments is one of the training. If somebody else has been in them since the
+        last one (an evaluation in the training environment), new episodes begin.
         """
         expected, self._expected = self._expected, [(-1, -1)] * len(self._wrapped)  # until the step is made
         if self._announce_step() != expected and expected is not None:
@@ -245,7 +245,7 @@ class GuidedOffPolicyAlgorithm(CheckedOffPolicyAlgorithm):
         return sorted(self._wrapped, key=lambda idx: not self.human_driving[idx])[:left]
 
     def _start_over(self) -> None:
-        """Begins new episodes in all environments."""
+        """Begin new episodes in all environments."""
         assert self.env is not None
         self.replay_buffer.end_trajectories()
         self._forget_episodes()
@@ -261,7 +261,7 @@ class GuidedOffPolicyAlgorithm(CheckedOffPolicyAlgorithm):
 
     def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
         """
-        As in SB3.
+        Load as SB3 does.
 
         :raises ValueError: if it is not a ``DualReplayBuffer``; then nothing is changed
         """

@@ -119,7 +119,7 @@ class CheckedOffPolicyAlgorithm(OffPolicyAlgorithm):
         device: th.device | str = "auto",
     ) -> None:
         """
-        As in SB3, but parameters of another algorithm or network are refused before any is copied.
+        Set parameters as SB3 does, but parameters of another algorithm or network are refused before any is copied.
 
         :raises MismatchedParameters: names what differs
         """

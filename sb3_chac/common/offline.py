@@ -1,4 +1,4 @@
-"""What the algorithms that learn from demonstrations alone (BC, CQL) share."""
+"""Base class for algorithms that learn from demonstrations alone (BC, CQL)."""
 
 import sys
 import time
@@ -38,7 +38,7 @@ class Batch(NamedTuple):
 
 class DatasetSampler:
     """
-    Deals out the steps of a dataset in shuffled passes. Whole episodes are kept apart for validation (neighbouring steps are
+    Sampler of transitions in shuffled epochs. Whole episodes are kept apart for validation (neighbouring steps are
     much alike); which, depends on the dataset only, so that a training that goes on does not learn from them. Of a single
     episode it is the end.
 
@@ -68,7 +68,7 @@ class DatasetSampler:
 
     @property
     def epochs(self) -> float:
-        """How often the training steps were gone through."""
+        """Number of epochs completed, with the fraction of the present one."""
         return self.drawn / len(self.training)
 
     def draw(self) -> np.ndarray:

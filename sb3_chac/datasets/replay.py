@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 class Replay(Runner):
     """
-    Repeats the actions of an episode. A context manager, which closes its environment.
+    Replay of the actions of an episode. A context manager, which closes its environment.
 
     :param dataset: holds the episode
     :param number: of the episode

@@ -1,4 +1,4 @@
-"""Who drives during a takeover: a scripted driver, a trained model or any function of the observation."""
+"""Experts, which drive during a takeover: a scripted driver, a trained model or any function of the observation."""
 
 import os
 from collections.abc import Callable
@@ -16,7 +16,7 @@ from sb3_chac.common.naming import is_name, named_object
 
 
 class Expert(Protocol):
-    """What drives in the human's place. It may also have ``time_to_trouble(observation, action)``, see ``RiskRule``."""
+    """Driver in the human's place. It may also have ``time_to_trouble(observation, action)``, see ``RiskRule``."""
 
     def reset(self, seed: int | None = None) -> None:
         """
@@ -106,7 +106,7 @@ def make_expert(expert: Any, env: gym.Env) -> Expert:
 
 def check_expert(expert: Any, env: gym.Env) -> None:
     """
-    What can be checked without building the expert; whether ``env`` knows a name shows in ``make_expert``.
+    Check what can be checked without building the expert; whether ``env`` knows a name shows in ``make_expert``.
 
     :raises ValueError: see ``make_expert``
     """

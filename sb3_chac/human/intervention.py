@@ -19,7 +19,7 @@ from sb3_chac.human.supervisor import Supervisor
 
 
 class ControlState(StrEnum):
-    """Who has control. An environment that is not armed stays AUTONOMOUS."""
+    """States of control. An environment that is not armed stays AUTONOMOUS."""
 
     AUTONOMOUS = "autonomous"  # the novice drives and the human watches
     TAKEOVER = "takeover"  # the human drives
@@ -130,31 +130,37 @@ class InterventionWrapper(contract.TakeoverWrapper, RecordConstructorArgs):
 
     @property
     def deadline(self) -> float | None:
+        """Seconds that expert and rule have for each answer, None for as long as they need."""
         return self._supervisor.deadline
 
     @property
     def armed(self) -> bool:
+        """Tell whether the human watches."""
         return self._armed
 
     @property
     def state(self) -> ControlState:
+        """State of control."""
         return self._state
 
     @property
     def human_steps(self) -> int:
+        """Number of steps that the human drove so far."""
         return self._human_steps
 
     @property
     def total_steps(self) -> int:
+        """Number of steps made while armed so far."""
         return self._total_steps
 
     @property
     def takeover_rate(self) -> float:
+        """Share of the steps made while armed that the human drove."""
         return self._human_steps / self._total_steps if self._total_steps else 0.0
 
     def arm(self, step_by_step: bool = False) -> None:
         """
-        From the next step on the human watches, also in the middle of an episode. If armed already, it goes on as it is.
+        Let the human watch from the next step on, also in the middle of an episode. If armed already, it goes on as it is.
 
         :param step_by_step: only in the steps that ``begin_step`` announces; in all others the wrapper is inert. That also
             holds for a wrapper that is armed already
@@ -185,14 +191,14 @@ class InterventionWrapper(contract.TakeoverWrapper, RecordConstructorArgs):
         return made
 
     def disarm(self) -> None:
-        """Ends a takeover and a pause; from the next step on the wrapper is inert. The counts are kept."""
+        """End a takeover and a pause; from the next step on the wrapper is inert. The counts are kept."""
         self._on("hand back")
         self._on("resume")
         self._armed = self._has_to_start = self._is_granted = False
 
     def set_rule(self, rule: Any = None) -> None:
         """
-        From the next step on another rule decides, e.g. "always" while the human demonstrates.
+        Change the rule from the next step on, e.g. to "always" while the human demonstrates.
 
         :param rule: see ``make_rule``; None for the rule that the wrapper was made with
         :raises ValueError: for a rule that does not fit; nothing is changed then
@@ -201,7 +207,7 @@ class InterventionWrapper(contract.TakeoverWrapper, RecordConstructorArgs):
 
     def pause(self) -> None:
         """
-        The human is no longer asked, which ends a takeover; steps go on counting.
+        Stop asking the human, which ends a takeover; steps go on counting.
 
         :raises RuntimeError: if the wrapper is not armed
         """
@@ -210,7 +216,7 @@ class InterventionWrapper(contract.TakeoverWrapper, RecordConstructorArgs):
 
     def resume(self) -> None:
         """
-        The human is asked again, unless the budget is spent.
+        Ask the human again, unless the budget is spent.
 
         :raises RuntimeError: if the wrapper is not armed
         """
@@ -303,7 +309,7 @@ class InterventionWrapper(contract.TakeoverWrapper, RecordConstructorArgs):
 
     @property
     def hud(self) -> dict[str, Any]:
-        """What a ``TakeoverDisplay`` may show."""
+        """Values for a ``TakeoverDisplay``."""
         return {
             "takeover": self._state is ControlState.TAKEOVER,
             "steps": self._total_steps,
@@ -355,7 +361,7 @@ class InterventionWrapper(contract.TakeoverWrapper, RecordConstructorArgs):
             self._start()
 
     def _start(self) -> None:
-        """Tells expert and rule that they are asked from now on; before the first reset() there is nothing to look at yet."""
+        """Tell expert and rule that they are asked from now on; before the first reset() there is nothing to look at yet."""
         if self._observation is None:
             return
         observation, self._observation = self._observation, None  # stays None if anything fails

@@ -1,4 +1,4 @@
-"""When the human drives: takeover rules, from the observation and from what novice and expert would do."""
+"""Takeover rules: when the human drives, from the observation and from what novice and expert would do."""
 
 import copy
 import math
@@ -18,7 +18,7 @@ RULE_NAMES = ("risk", "disagreement", "always", "never")
 
 @runtime_checkable
 class TakeoverRule(Protocol):
-    """Decides who drives. One object serves one environment, as it may remember."""
+    """Rule that decides who drives. One object serves one environment, as it may remember."""
 
     def reset(self) -> None:
         """Forget: a new episode starts, or the human is asked again after a break."""
@@ -210,7 +210,7 @@ CONFIGURABLE: dict[str, Callable[..., TakeoverRule]] = {
 
 def check_rule(rule: Any, expert: Any, rule_kwargs: dict[str, Any] | None = None) -> None:
     """
-    What can be checked without building anything: the predictor of a scripted driver that is still a name is not.
+    Check what can be checked without building anything: the predictor of a scripted driver that is still a name is not.
 
     :param rule: see ``make_rule``
     :param expert: see ``make_expert``

@@ -224,7 +224,7 @@ class SACLag(CostConstrainedAlgorithm, CheckedOffPolicyAlgorithm, SAC):
 
     def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
         """
-        As in SB3.
+        Load as SB3 does.
 
         :raises ValueError: if it holds no costs; then nothing is changed
         """

@@ -1,4 +1,4 @@
-"""What RL-Zoo3's experiments do besides with our algorithms and environments: see the function of each method."""
+"""Hooks added to RL-Zoo3's ExperimentManager for our algorithms and environments: see the function of each method."""
 
 import atexit
 import contextlib
@@ -115,7 +115,7 @@ def setup_experiment(original: Callable[..., Any], manager: Any) -> Any:
 
 
 def create_envs(original: Callable[..., Any], manager: Any, *args: Any, **kwargs: Any) -> Any:
-    """Processes of environments leave signals to the one that trains: a terminal sends Ctrl-C to all of them."""
+    """Create environments, whose processes leave signals to the one that trains: a terminal sends Ctrl-C to all of them."""
     if not is_ours(manager) or manager.vec_env_class is not SubprocVecEnv:
         return original(*args, **kwargs)
     before = {number: signal.signal(number, signal.SIG_IGN) for number in (signal.SIGINT, signal.SIGTERM)}
@@ -182,8 +182,8 @@ def save_config(original: Callable[..., None], manager: Any, saved_hyperparams: 
 
 def learn(original: Callable[..., None], manager: Any, model: Any) -> None:
     """
-    From a checkpoint on, only the steps that remain of the total are made, and counted on. SIGTERM and Ctrl-C end the training
-    after a checkpoint, if it writes any.
+    Learn, from a checkpoint on only the steps that remain of the total. SIGTERM and Ctrl-C end the training after a
+    checkpoint, if it writes any.
     """
     if is_ours(manager):
         with one_line_of(manager, OSError, ValueError, ExpertError, RuleError):

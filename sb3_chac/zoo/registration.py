@@ -1,4 +1,4 @@
-"""What RL-Zoo3 has to be told of our algorithms, and gymnasium of our environments."""
+"""Registration of our algorithms with RL-Zoo3, and of our environments with gymnasium."""
 
 import contextlib
 import functools

@@ -20,8 +20,8 @@ class BadMessage(ValueError):
 
 class Held(NamedTuple):
     """
-    What the driver holds: keys, a gamepad if there is one (stick to the right, right trigger, left trigger), and while the
-    screen is touched, steering (-1 left to 1 right) and pedals (-1 brake to 1 throttle) of its pads.
+    Controls that the driver holds: keys, a gamepad if there is one (stick to the right, right trigger, left trigger), and
+    while the screen is touched, steering (-1 left to 1 right) and pedals (-1 brake to 1 throttle) of its pads.
     """
 
     keys: frozenset[str]
@@ -94,7 +94,7 @@ class Browser:
         self.taken = True
 
     def leave(self) -> None:
-        """Nobody is there any more. A takeover is not over by that."""
+        """Note that nobody is there any more. A takeover is not over by that."""
         self.taken, self.heard_at, self.time = False, -math.inf, -math.inf
         self.go_away()
 

@@ -31,7 +31,7 @@ TRIGGER = 25.0, 45.0  # [m] ahead of the vehicle when somebody begins to cross
 
 
 class Kind(NamedTuple):
-    """Who crosses."""
+    """Kind of those who cross."""
 
     name: str
     length: float  # [m]
@@ -180,7 +180,7 @@ class RoadTestEnv(SafeDriveEnv):
 
     @property
     def command(self) -> str:
-        """What the driver is told for the next junction: "left", "straight" or "right"."""
+        """Command for the next junction: "left", "straight" or "right"."""
         s = 0.0
         for block in self.map.blocks:
             start, s = s, s + length(block.route)

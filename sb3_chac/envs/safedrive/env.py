@@ -163,7 +163,7 @@ class SafeDriveEnv(DrivingEnv):
     # Scenes
 
     def _scene(self, scenario: int) -> Scene:
-        """The scene of a scenario, made when it is first needed."""
+        """Return the scene of a scenario, made when it is first needed."""
         if scenario in self._scenes:
             self._scenes.move_to_end(scenario)
             return self._scenes[scenario]
@@ -242,11 +242,11 @@ class SafeDriveEnv(DrivingEnv):
         return action
 
     def _locate(self) -> None:
-        """Where the ego is on the route, looked for close to where it was (the route may pass near itself)."""
+        """Find where the ego is on the route, close to where it was (the route may pass near itself)."""
         self.s, self.lateral, self.heading_error = locate(self.map.route, self.s, self.ego.position, self.ego.heading)
 
     def _find_boxes(self) -> None:
-        """Everything that can be hit or seen: first the cars of the traffic that are there, then the obstacles."""
+        """Collect everything that can be hit or seen: first the cars of the traffic that are there, then the obstacles."""
         traffic, scene = self.traffic, self.scene
         obstacles = scene.obstacle_positions, scene.obstacle_headings, scene.obstacle_sizes, traffic.obstacle_there
         self.box_positions, self.box_headings, self.box_lengths, self.box_widths = _boxes(

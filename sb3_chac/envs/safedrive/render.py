@@ -145,7 +145,7 @@ class Viewer(Display):
         self.pygame.draw.lines(self.canvas, colour, False, self._to_canvas(points).tolist(), 2 * FINE)
 
     def _paint_parked(self, position: np.ndarray, heading: float) -> None:
-        """With hazard lights."""
+        """Paint a parked vehicle, with hazard lights."""
         self._paint_vehicle(position, heading, PARKED)
         if self.env.steps // 4 % 2 == 0:
             corners = np.array([(2.3, 0.9), (2.3, -0.9), (-2.3, 0.9), (-2.3, -0.9)]) @ turned(heading)

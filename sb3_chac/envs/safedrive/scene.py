@@ -9,7 +9,7 @@ from sb3_chac.envs.safedrive.traffic import Traffic
 
 
 class Scene(NamedTuple):
-    """What a scenario number stands for."""
+    """Map, traffic, obstacles and starting lane of a scenario."""
 
     map: Map
     traffic: Traffic
