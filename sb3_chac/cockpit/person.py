@@ -8,6 +8,7 @@ import numpy as np
 from gymnasium import spaces
 
 from sb3_chac.cockpit.devices import Command, Device, DriverInput
+from sb3_chac.common.contract import scale_action
 
 
 class NotDrivable(ValueError):
@@ -53,7 +54,7 @@ class Person:
         :param box: action space, shape (2,): steering, then throttle (its upper bound) or brake (its lower bound)
         :param steers_left: whether the greatest first action is fully to the left
         """
-        self._low, self._high, self.steers_left = box.low.astype(float), box.high.astype(float), steers_left
+        self._box, self.steers_left = box, steers_left
 
     def handle(self, event: Any) -> Command | None:
         """
@@ -103,7 +104,8 @@ class Person:
         :return: the action in the units of the environment, shape (2,)
         """
         scaled = np.array([-steering if self.steers_left else steering, pedals])
-        return self._low + (scaled + 1) / 2 * (self._high - self._low)
+        low, high = self._box.low.astype(float), self._box.high.astype(float)
+        return low + (scaled + 1) / 2 * (high - low)
 
     def as_input(self, action: np.ndarray) -> tuple[float, float]:
         """
@@ -112,7 +114,7 @@ class Person:
         :param action: in the units of the environment, shape (2,)
         :return: steering (-1 left to 1 right) and pedals (-1 brake to 1 throttle)
         """
-        steering, pedals = 2 * (np.asarray(action, float) - self._low) / (self._high - self._low) - 1
+        steering, pedals = scale_action(action, self._box)
         return float(-steering if self.steers_left else steering), float(pedals)
 
     # Expert and rule

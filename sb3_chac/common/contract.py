@@ -100,6 +100,18 @@ def _truth(key: str, value: Any, env_idx: int) -> bool:
     return bool(np.any(array))
 
 
+def scale_action(action: np.ndarray, action_space: spaces.Box) -> np.ndarray:
+    """
+    Scale an action.
+
+    :param action: in the units of the environment
+    :param action_space: a Box with finite bounds
+    :return: ``action`` with the bounds mapped to -1 and 1, in float64
+    """
+    low, high = action_space.low.astype(np.float64), action_space.high.astype(np.float64)
+    return 2 * (np.asarray(action, dtype=np.float64) - low) / (high - low) - 1
+
+
 def scaled(action: np.ndarray, action_space: spaces.Space, env_idx: int) -> np.ndarray:
     """
     Scale the human's action.
@@ -109,8 +121,7 @@ def scaled(action: np.ndarray, action_space: spaces.Space, env_idx: int) -> np.n
     :raises ValueError: if it is outside of the bounds
     """
     assert isinstance(action_space, spaces.Box)
-    low, high = action_space.low.astype(np.float64), action_space.high.astype(np.float64)
-    values = 2 * (action - low) / (high - low) - 1
+    values = scale_action(action, action_space)
     if np.any(np.abs(values) > 1 + TOLERANCE):
         raise ValueError(
             f"The human's action of environment {env_idx} is out of bounds, {action} is not in {action_space}: clip it, or "

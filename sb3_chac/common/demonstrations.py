@@ -10,7 +10,7 @@ from gymnasium import spaces
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.vec_env import VecTransposeImage
 
-from sb3_chac.common.checks import is_finite
+from sb3_chac.common.checks import check_action_space, is_finite
 from sb3_chac.common.contract import NOVICE_ACTION, TAKEOVER
 from sb3_chac.common.minari_datasets import HOW_TO_GET_ONE, DatasetError, damaged, is_minari_dataset, open_dataset
 
@@ -181,6 +181,19 @@ def check_spaces(observation_space: spaces.Space, action_space: spaces.Space) ->
         )
     if not isinstance(action_space, spaces.Box | spaces.Discrete):
         raise DatasetError(f"Demonstrations need Box or Discrete actions, got {action_space}. Wrap the environment.")
+
+
+def check_imitable(env: Any) -> None:
+    """
+    Check that an algorithm can imitate in an environment: a dataset can hold its spaces, and a Box of actions is bounded.
+
+    :param env: a gymnasium or vectorized environment
+    :raises DatasetError: for other spaces
+    :raises UnsupportedActionSpace: for actions without finite bounds
+    """
+    check_spaces(env.observation_space, env.action_space)
+    if isinstance(env.action_space, spaces.Box):
+        check_action_space(env.action_space)
 
 
 def space_difference(found: spaces.Space, expected: spaces.Space) -> str:

@@ -1,7 +1,5 @@
 """Base class for algorithms that learn from takeovers: asking the human, storing who drove, counting."""
 
-import io
-import pathlib
 import warnings
 from collections import deque
 from typing import Any, TypeVar
@@ -50,6 +48,7 @@ class GuidedOffPolicyAlgorithm(CheckedOffPolicyAlgorithm):
     proposed. Environments that do the takeovers themselves may report them in ``info``, see ``contract.read_report``.
     """
 
+    required_buffer = DualReplayBuffer
     replay_buffer: DualReplayBuffer
 
     def _setup_model(self) -> None:
@@ -258,18 +257,6 @@ class GuidedOffPolicyAlgorithm(CheckedOffPolicyAlgorithm):
         super()._update_info_buffer(infos, dones)
         assert dones is not None
         self._expected = [(0, int(dones[idx])) for idx in self._wrapped]  # a VecEnv resets what is over
-
-    def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
-        """
-        Load as SB3 does.
-
-        :raises ValueError: if it is not a ``DualReplayBuffer``; then nothing is changed
-        """
-        before = self.replay_buffer
-        super().load_replay_buffer(path, truncate_last_traj)
-        if not isinstance(self.replay_buffer, DualReplayBuffer):
-            other, self.replay_buffer = self.replay_buffer, before
-            raise ValueError(f"load_replay_buffer: {path} holds no DualReplayBuffer, got {type(other).__name__}.")
 
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1

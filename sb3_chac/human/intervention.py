@@ -14,7 +14,7 @@ from sb3_chac.common import contract
 from sb3_chac.common.arguments import checked
 from sb3_chac.common.checks import check_action_space, check_integer, check_range
 from sb3_chac.human.experts import check_expert
-from sb3_chac.human.rules import check_rule, scale_action
+from sb3_chac.human.rules import check_rule
 from sb3_chac.human.supervisor import Supervisor
 
 
@@ -383,6 +383,6 @@ class InterventionWrapper(contract.TakeoverWrapper, RecordConstructorArgs):
         return array.astype(self._box.dtype)
 
     def _cosine_distance(self, novice_action: np.ndarray, expert_action: np.ndarray) -> float:
-        novice, expert = (scale_action(action, self._box).ravel() for action in (novice_action, expert_action))
+        novice, expert = (contract.scale_action(action, self._box).ravel() for action in (novice_action, expert_action))
         norms = np.linalg.norm(novice) * np.linalg.norm(expert)
         return float(np.clip(1 - novice @ expert / norms, 0, 2)) if norms > 0 else 0.0

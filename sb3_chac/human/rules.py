@@ -11,6 +11,7 @@ from gymnasium import spaces
 
 from sb3_chac.common.arguments import checked
 from sb3_chac.common.checks import check_action_space, check_integer, check_range
+from sb3_chac.common.contract import scale_action
 from sb3_chac.common.naming import is_name, named_object
 
 RULE_NAMES = ("risk", "disagreement", "always", "never")
@@ -158,18 +159,6 @@ def always(observation: Any, novice_action: np.ndarray, expert_action: np.ndarra
 def never(observation: Any, novice_action: np.ndarray, expert_action: np.ndarray) -> bool:
     """The human only watches: steps and what the expert would do are counted, the novice drives."""
     return False
-
-
-def scale_action(action: np.ndarray, action_space: spaces.Box) -> np.ndarray:
-    """
-    Scale an action.
-
-    :param action: in the units of the environment
-    :param action_space: a Box with finite bounds
-    :return: ``action`` with the bounds mapped to -1 and 1, in float64
-    """
-    low, high = action_space.low.astype(np.float64), action_space.high.astype(np.float64)
-    return 2 * (np.asarray(action, dtype=np.float64) - low) / (high - low) - 1
 
 
 def make_rule(rule: Any, env: gym.Env, expert: Any, rule_kwargs: dict[str, Any] | None = None) -> TakeoverRule:

@@ -201,13 +201,13 @@ class Display:
         draw.rect(canvas, RED, canvas.get_rect(), 10 * FINE)
         draw.circle(canvas, RED, self._to_canvas(self.centre), 26 * FINE, 4 * FINE)
 
-    def _finish(self, info: dict[str, Any], flash: bool) -> None:
+    def _finish(self, info: dict[str, Any]) -> None:
         """
         Add signs of a collision and the panel.
 
         :param info: of the last step
-        :param flash: whether a collision is to be seen
         """
+        flash = any(self.env.steps - step < FLASH_STEPS for step in self.env._touched.values())
         if flash:
             self._paint_flash()
         self.pygame.transform.smoothscale(self.canvas, SIZE, self.picture)
