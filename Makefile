@@ -42,23 +42,34 @@ format: $(INSTALLED)
 docs: $(INSTALLED)
 	$(BIN)/sphinx-build --fail-on-warning --keep-going --quiet -b html docs docs/_build/html
 
-# Hours: see benchmarks/README.md
+# Every benchmark, quick ones first. Days in all: most do only what is missing, so stop it at any time. Not here, as it needs an
+# environment of its own: `parity.py d3rlpy`. See benchmarks/README.md
 bench: $(INSTALLED)
 	$(BIN)/python benchmarks/speed.py
-	$(BIN)/python benchmarks/learning.py run --jobs 2
-	$(BIN)/python benchmarks/learning.py report
 	$(BIN)/python benchmarks/safedrive.py speed
-	$(BIN)/python benchmarks/safedrive.py drivers
 	$(BIN)/python benchmarks/safedrive.py traffic
 	$(BIN)/python benchmarks/safedrive.py takeovers
-	$(BIN)/python benchmarks/safedrive.py learn --jobs 2
-	$(BIN)/python benchmarks/safedrive.py report
+	$(BIN)/python benchmarks/safedrive.py drivers
 	$(BIN)/python benchmarks/dagger.py --hidden 512
-	$(BIN)/python benchmarks/guidance.py run --jobs 2
-	$(BIN)/python benchmarks/guidance.py report
-	$(BIN)/python benchmarks/guidance.py agents
-	$(BIN)/python benchmarks/guidance.py cost
-	$(BIN)/python benchmarks/metadrive_safety.py drivers
+	$(BIN)/python benchmarks/sb3_suite.py
+	$(BIN)/python benchmarks/refusals.py
+	$(BIN)/python benchmarks/chaos.py
+	for part in export latency link cuts report; do $(BIN)/python benchmarks/deploy.py $$part || exit; done
+	for part in drive "drive --env MetaDriveSafety-v0" browser report; do $(BIN)/python benchmarks/cockpit.py $$part || exit; done
+	for part in data ours report; do $(BIN)/python benchmarks/parity.py $$part || exit; done
+	$(BIN)/python benchmarks/confidence.py run benchmarks/agents/chac-SafeDrive-v0.zip
+	$(BIN)/python benchmarks/confidence.py report
+	for part in train test report; do $(BIN)/python benchmarks/roadtest.py $$part || exit; done
+	for part in "drivers --jobs 2" report; do $(BIN)/python benchmarks/metadrive_safety.py $$part || exit; done
+	for part in "learn --jobs 2" report; do $(BIN)/python benchmarks/safedrive.py $$part || exit; done
+	for part in "rounds --jobs 2" "gail --jobs 2" report; do $(BIN)/python benchmarks/imitation.py $$part || exit; done
+	for part in "run --jobs 2" report; do $(BIN)/python benchmarks/learning.py $$part || exit; done
+	for part in "run --jobs 2" report; do $(BIN)/python benchmarks/lagrangian.py $$part || exit; done
+	for part in "run --jobs 2" report agents cost; do $(BIN)/python benchmarks/guidance.py $$part || exit; done
+	$(BIN)/python benchmarks/foresight.py benchmarks/models/SafeDrive-v0/chac-stage-1-*.zip
+	for part in "run --jobs 2" report; do $(BIN)/python benchmarks/suite.py $$part || exit; done
+	$(BIN)/python benchmarks/film.py
+	$(BIN)/python benchmarks/tables.py
 
 $(INSTALLED): setup.cfg pyproject.toml constraints.txt build_hooks.py sb3_chac.pth sb3_chac.start
 	python3 -m venv $(VENV)

@@ -1,6 +1,7 @@
-"""Put ``sb3_chac.pth`` and ``sb3_chac.start`` into the root of every wheel, so that they land in site-packages.
+"""Put files into every wheel that stand outside of the package.
 
-They make the stock ``rl_zoo3`` command know our algorithms, see ``sb3_chac/_startup.py``.
+``sb3_chac.pth`` and ``sb3_chac.start`` go into its root, so that they land in site-packages: they make the stock ``rl_zoo3``
+command know our algorithms, see ``sb3_chac/_startup.py``. ``hyperparams/`` goes into the package.
 """
 
 import json
@@ -13,17 +14,25 @@ from setuptools.command.editable_wheel import editable_wheel
 STARTUP_FILES = ("sb3_chac.pth", "sb3_chac.start")
 
 
+def outside() -> dict[str, str]:
+    """:return: files outside of the package -> where they are in the wheel"""
+    hyperparams = {str(path): str("sb3_chac" / path) for path in sorted(Path("hyperparams").rglob("*.yml"))}
+    return {name: name for name in STARTUP_FILES} | hyperparams
+
+
 class BuildPy(build_py):
     """Wheels and ``pip install .``: copy the files beside the package."""
 
     def run(self) -> None:
         super().run()
         if not self.editable_mode:
-            for name in STARTUP_FILES:
-                self.copy_file(name, str(Path(self.build_lib) / name))
+            for name, place in outside().items():
+                target = Path(self.build_lib, place)
+                self.mkpath(str(target.parent))
+                self.copy_file(name, str(target))
 
     def get_outputs(self, include_bytecode: bool = True) -> list[str]:
-        return super().get_outputs(include_bytecode) + [str(Path(self.build_lib) / name) for name in STARTUP_FILES]
+        return super().get_outputs(include_bytecode) + [str(Path(self.build_lib, place)) for place in outside().values()]
 
 
 class EditableWheel(editable_wheel):

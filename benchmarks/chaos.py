@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 
 from sb3_chac import CHAC
-from sb3_chac.common.checkpoints import BUFFER, FOLDER, checkpoints, newest_checkpoint, sound_checkpoint
+from sb3_chac.common.checkpoint_files import BUFFER, FOLDER, checkpoints, newest_checkpoint, sound_checkpoint
 
 ENV = "SafeDrive-v0"
 BUDGET = 60  # steps of the human

@@ -37,8 +37,9 @@ import pygame
 import torch as th
 
 from sb3_chac.cli import drive as command
+from sb3_chac.cockpit.address import Address
 from sb3_chac.cockpit.devices import Device, Keyboard
-from sb3_chac.cockpit.devices.browser import Address, Browser
+from sb3_chac.cockpit.devices.browser import Browser
 from sb3_chac.cockpit.devices.emulator import DeviceEmulator
 from sb3_chac.cockpit.experiment import CockpitRun
 from sb3_chac.cockpit.window import Window
@@ -114,7 +115,13 @@ def measure(env: str, minutes: float) -> None:
                 drive = run.drive
                 now, heard = time.monotonic(), drive.person.input.time
                 steps.append(
-                    {"time": now, "heard": heard, "lag": drive.lag, "stage": drive.novice.stage, "frames": window.frames}
+                    {
+                        "time": now,
+                        "heard": heard,
+                        "lag": drive.lag,
+                        "stage": drive.display.novice.stage,
+                        "frames": window.frames,
+                    }
                 )
                 return step(action)
 
@@ -175,7 +182,7 @@ def measure_browser(env: str, minutes: float) -> None:
         with sync_playwright() as playwright:
             browser = playwright.chromium.launch(executable_path=chromium(), args=["--no-sandbox"])
             page = browser.new_page(viewport={"width": 1200, "height": 780}, has_touch=True)
-            page.goto(server.address.url(server.driver_token))
+            page.goto(server.access.address.url(server.access.driver_token))
             page.wait_for_selector("text=You are at the wheel")
             page.keyboard.press("KeyP")
             fingers, pedals = page.context.new_cdp_session(page), page.locator("#pedals").bounding_box()
@@ -331,7 +338,7 @@ def pictures_of_the_page() -> None:
             browser = playwright.chromium.launch(executable_path=chromium(), args=["--no-sandbox"])
             for name, width, height, touch in (("browser", 1280, 800, False), ("phone", 844, 390, True)):
                 page = browser.new_page(viewport={"width": width, "height": height}, has_touch=touch)
-                page.goto(server.address.url(server.driver_token))
+                page.goto(server.access.address.url(server.access.driver_token))
                 page.wait_for_selector("text=You are at the wheel")
                 begun = run.drive.display.number
                 while run.drive.display.number < begun + 40:

@@ -26,7 +26,7 @@ import yaml
 
 import sb3_chac
 from sb3_chac.cli.plot import join
-from sb3_chac.common.checkpoints import FOLDER, newest_checkpoint, sound_checkpoint
+from sb3_chac.common.checkpoint_files import FOLDER, newest_checkpoint, sound_checkpoint
 from sb3_chac.common.demonstrations import load_demonstrations
 from sb3_chac.zoo.algorithms import ALGORITHMS, hyperparams_file
 from sb3_chac.zoo.runs import steps

@@ -360,7 +360,7 @@ def test_the_human_is_no_longer_asked():
     assert wrapper(model).hud["stage"] == 2
     model.learn(10)
     assert len(model.replay_buffer.human) == 31
-    assert len(wrapper(model).get_wrapper_attr("_rule").proposed) == 31
+    assert len(wrapper(model).get_wrapper_attr("_supervisor").rule.proposed) == 31
 
 
 @pytest.mark.parametrize("share, n_human", [(0.0, 0), (0.25, 4), (1.0, 16)])

@@ -24,18 +24,16 @@ from test_zoo import swings
 
 import sb3_chac
 from sb3_chac import CHAC, DPVP, DSAC, SACLag
-from sb3_chac.common.checkpoints import (
+from sb3_chac.common.checkpoint_files import (
     BUFFER,
     CONTENTS,
     DamagedCheckpoint,
-    ResumableCheckpoint,
-    StopSignals,
-    TrainingStopped,
     checkpoints,
     newest_checkpoint,
     sound_checkpoint,
     verify,
 )
+from sb3_chac.common.checkpoints import ResumableCheckpoint, StopSignals, TrainingStopped
 from sb3_chac.zoo.algorithms import ALGORITHMS
 from sb3_chac.zoo.experiments import learn_ours
 
@@ -225,7 +223,7 @@ def test_a_model_that_is_no_longer_finite_does_not_replace_one_that_was(tmp_path
 def test_weights_load_without_code():
     """As SB3's coming safe deserialisation wants it: what the networks need is tensors, numbers and names."""
     for path in sorted((BENCHMARKS / "agents").glob("*.zip")):
-        assert sb3_chac.common.checkpoints.verify_model(path)["policy_class"]  # torch.load(..., weights_only=True)
+        assert sb3_chac.common.checkpoint_files.verify_model(path)["policy_class"]  # torch.load(..., weights_only=True)
 
 
 @pytest.mark.parametrize("name", ALGORITHMS.values())
@@ -235,7 +233,7 @@ def test_saved_weights_of_every_algorithm_load_without_code(tmp_path, name):
     accepted = inspect.signature(algorithm).parameters
     kwargs = {argument: value for argument, value in given.items() if argument in accepted}
     algorithm("MlpPolicy", "Pendulum-v1", **kwargs).save(tmp_path / "model.zip")
-    assert sb3_chac.common.checkpoints.verify_model(tmp_path / "model.zip")
+    assert sb3_chac.common.checkpoint_files.verify_model(tmp_path / "model.zip")
 
 
 def test_the_memory_of_stage_2_is_flat_without_a_logger(monkeypatch):

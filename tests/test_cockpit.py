@@ -31,12 +31,12 @@ from sb3_chac.cockpit.devices import (
     save_config,
 )
 from sb3_chac.cockpit.devices.emulator import DeviceEmulator
-from sb3_chac.cockpit.learner import driven
+from sb3_chac.cockpit.driven import driven
 from sb3_chac.cockpit.person import NotDrivable, Person, check_drivable
 from sb3_chac.cockpit.recording import FOLDER
 from sb3_chac.cockpit.session import SessionEnded
 from sb3_chac.cockpit.window import Window
-from sb3_chac.common.checkpoints import sound_checkpoint
+from sb3_chac.common.checkpoint_files import sound_checkpoint
 from sb3_chac.common.demonstrations import load_demonstrations
 
 
@@ -331,8 +331,8 @@ def test_slow_updates_do_not_hold_up_the_drive(tmp_path):
 
     def slowly(*args):
         """As long as 12 steps: it would never be done if they waited for it."""
-        begun_at.append(drive.display.total_steps)
-        wait_until(lambda: drive.display.total_steps >= begun_at[-1] + 12 or drive.ended)
+        begun_at.append(drive.totals.total_steps)
+        wait_until(lambda: drive.totals.total_steps >= begun_at[-1] + 12 or drive.ended)
         train_now(*args)
         if len(begun_at) >= 4:
             drive.quit()
@@ -361,10 +361,10 @@ def test_stage_2_is_prepared_beside_the_drive_and_the_person_may_still_take_over
 
     def witnessed():
         """While a step of the car is made, and after it."""
-        prepared.append((threading.current_thread() is model.learner, drive.busy, drive.display.total_steps))
+        prepared.append((threading.current_thread() is model.learner, drive.busy, drive.totals.total_steps))
         if len(prepared) == 10:
             person.tap(pygame.K_SPACE)
-        wait_until(lambda: drive.display.total_steps > prepared[-1][2])
+        wait_until(lambda: drive.totals.total_steps > prepared[-1][2])
         prefit_step()
 
     def in_turn(action):
@@ -382,8 +382,8 @@ def test_stage_2_is_prepared_beside_the_drive_and_the_person_may_still_take_over
     assert prepared[0][2] >= 30 and prepared[-1][2] > prepared[0][2] + 5  # stage 1 went on meanwhile
     assert model._n_updates == 80 - model.learning_starts
     assert 10 < model.counts["human_steps"] < 50  # none before the switch, until the episode ended
-    assert drive.novice.stage == "2: self-learning" and 0 <= drive.novice.confidence <= 1
-    assert 0 <= drive.novice.risk <= 1
+    assert drive.display.novice.stage == "2: self-learning" and 0 <= drive.display.novice.confidence <= 1
+    assert 0 <= drive.display.novice.risk <= 1
     env.recorder.finish()
 
 
@@ -405,9 +405,9 @@ def test_the_unattended_brake_is_not_learned_from(tmp_path):
     model, drive, env = make_driven(DPVP, tmp_path, device, rate=200.0)
     thread = threading.Thread(target=lambda: model.learn(10_000), daemon=True)
     thread.start()
-    wait_until(lambda: drive.display.total_steps >= 2)
+    wait_until(lambda: drive.totals.total_steps >= 2)
     emulator.button(4)
-    wait_until(lambda: drive.display.human_steps >= 3)
+    wait_until(lambda: drive.totals.human_steps >= 3)
     emulator.unplug()
     wait_until(lambda: drive.paused)
     drive.quit()
@@ -502,7 +502,7 @@ def play(monkeypatch, script):
         nonlocal last_press
         draw(window)
         frames.append(pygame.surfarray.array3d(window.screen).std())
-        steps = window.drive.display.total_steps
+        steps = window.drive.totals.total_steps
         if todo and steps >= last_press + todo[0][0]:
             DeviceEmulator().press(todo.pop(0)[1])
             last_press = steps  # on a busy machine few steps are drawn: the next key must not follow at once

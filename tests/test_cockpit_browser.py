@@ -20,9 +20,12 @@ from cockpit_toys import Car, cockpit
 from shell import FOREVER, wait_until
 
 from sb3_chac.__main__ import main
+from sb3_chac.cockpit import access
 from sb3_chac.cockpit import server as server_module
-from sb3_chac.cockpit.devices.browser import STALE, Address, BadMessage, Browser, Held, Wish, parse, parse_address
-from sb3_chac.cockpit.server import MOST_CONNECTIONS, MOST_MESSAGES, MOST_REQUESTS, MOST_VIEWERS, Server, tls_context
+from sb3_chac.cockpit.access import MOST_CONNECTIONS, MOST_REQUESTS
+from sb3_chac.cockpit.address import Address, parse_address
+from sb3_chac.cockpit.devices.browser import STALE, BadMessage, Browser, Held, Wish, parse
+from sb3_chac.cockpit.server import MOST_MESSAGES, MOST_VIEWERS, Server, tls_context
 from sb3_chac.cockpit.session import SessionEnded
 from sb3_chac.cockpit.wrapper import STANDS
 
@@ -47,7 +50,7 @@ class Served:
         for thread in self.threads:
             thread.start()
         assert self.is_served.wait(FOREVER)
-        self.origin = f"{self.server.scheme}://127.0.0.1:{self.server.address.port}"
+        self.origin = f"{self.server.access.scheme}://127.0.0.1:{self.server.access.address.port}"
 
     def run(self):
         self.env.env.arm()
@@ -83,7 +86,7 @@ class Served:
     @asynccontextmanager
     async def viewer(self, token=None, origin=None, path="/ws"):
         async with aiohttp.ClientSession() as session:
-            token = self.server.driver_token if token is None else token
+            token = self.server.access.driver_token if token is None else token
             headers = {"Origin": self.origin if origin is None else origin}
             async with session.ws_connect(f"{self.origin}{path}?token={token}", headers=headers, max_msg_size=0) as channel:
                 yield channel
@@ -93,7 +96,7 @@ class Served:
 def served(tmp_path, monkeypatch, request):
     """Nobody is dropped because the machine is slow, unless the parameter says after how many seconds."""
     monkeypatch.setattr(server_module, "HEARTBEAT", None)
-    monkeypatch.setattr(server_module, "PATIENCE", getattr(request, "param", FOREVER))
+    monkeypatch.setattr(access, "PATIENCE", getattr(request, "param", FOREVER))
     drive = Served(tmp_path)
     yield drive
     drive.stop()
@@ -246,7 +249,7 @@ def test_keys_drive_and_space_hands_back(served):
 
 def test_viewers_get_pictures(served):
     async def look():
-        async with driving(served), served.viewer(served.server.spectator_token) as channel:
+        async with driving(served), served.viewer(served.server.access.spectator_token) as channel:
             while (message := await asyncio.wait_for(channel.receive(), FOREVER)).type is not aiohttp.WSMsgType.BINARY:
                 pass
             assert message.data.startswith(b"\xff\xd8\xff")  # JPEG
@@ -296,7 +299,10 @@ def test_a_lost_driver_pauses_the_novice(served):
 def test_spectators_and_second_drivers_only_watch(served):
     async def watch():
         async with driving(served):
-            for token, role in ((served.server.spectator_token, "spectator"), (served.server.driver_token, "taken")):
+            for token, role in (
+                (served.server.access.spectator_token, "spectator"),
+                (served.server.access.driver_token, "taken"),
+            ):
                 async with served.viewer(token) as channel:
                     assert (await state_of(channel))["role"] == role
                     for message in (
@@ -338,7 +344,7 @@ async def status(served, path, headers=None):
 
 def test_page_and_token(served):
     async def ask():
-        token = served.server.driver_token
+        token = served.server.access.driver_token
         code, page, headers = await status(served, f"/?token={token}")
         assert code == 200 and "cockpit.js" in page
         assert "default-src 'none'" in headers["Content-Security-Policy"] and headers["Referrer-Policy"] == "no-referrer"
@@ -426,7 +432,7 @@ def test_a_flood_of_requests_without_a_token(served):
 
 def test_who_is_refused_or_dropped_is_logged_without_a_token(served, caplog):
     async def come():
-        token = served.server.driver_token
+        token = served.server.access.driver_token
         assert (await status(served, f"/?token={token}x"))[0] == 403
         async with driving(served), served.viewer() as channel:
             await channel.send_str("{")
@@ -441,7 +447,7 @@ def test_too_many_viewers(served):
     async def crowd():
         async with driving(served):
             async with aiohttp.ClientSession() as session:
-                url = f"{served.origin}/ws?token={served.server.spectator_token}"
+                url = f"{served.origin}/ws?token={served.server.access.spectator_token}"
                 headers = {"Origin": served.origin}
                 channels = [await session.ws_connect(url, headers=headers) for _ in range(MOST_VIEWERS - 1)]
                 with pytest.raises(aiohttp.WSServerHandshakeError) as refused:
@@ -459,7 +465,7 @@ def test_too_many_viewers(served):
 def test_a_flood_of_connections(served):
     async def flood():
         async with driving(served):
-            address = ("127.0.0.1", served.server.address.port)
+            address = ("127.0.0.1", served.server.access.address.port)
 
             def connect_often():  # not in the thread in which the driver tells what it holds
                 return [socket.create_connection(address, timeout=FOREVER) for _ in range(3 * MOST_CONNECTIONS)]
@@ -562,7 +568,7 @@ def test_an_encrypted_cockpit(tmp_path):
         trusted = ssl.create_default_context(cafile=certificate)
         trusted.check_hostname = False
         async with aiohttp.ClientSession(connector=aiohttp.TCPConnector(ssl=trusted)) as session:
-            page = served.server.url(served.server.spectator_token)
+            page = served.server.access.url(served.server.access.spectator_token)
             async with session.get(page) as response:
                 assert response.status == 200 and "wss://" in response.headers["Content-Security-Policy"]
             address = page.replace("/?", "/ws?")
@@ -598,7 +604,7 @@ def test_in_chromium(served):
         def shows(element, text):
             wait_until(lambda: page.inner_text(f"#{element}") == text)
 
-        page.goto(served.server.url(served.server.driver_token))
+        page.goto(served.server.access.url(served.server.access.driver_token))
         shows("role", "You are at the wheel")
         page.keyboard.press("KeyP")
         shows("takeover-value", "no")

@@ -15,10 +15,12 @@ from cockpit_toys import Car, cockpit
 from shell import FOREVER, wait_until
 from test_cockpit_browser import CHROMIUM, NOVICE, Served
 
+from sb3_chac.cockpit import access
 from sb3_chac.cockpit import server as server_module
-from sb3_chac.cockpit.devices.browser import MOMENT, Address, BadMessage, Browser, Held, Wish, parse
+from sb3_chac.cockpit.address import Address
+from sb3_chac.cockpit.devices.browser import MOMENT, BadMessage, Browser, Held, Wish, parse
 from sb3_chac.cockpit.meter import CALM, LEAST, GuidanceMeter
-from sb3_chac.cockpit.session import Display, Novice, asks_for_help, indicators, who_drives
+from sb3_chac.cockpit.session import Display, Novice, Totals, asks_for_help, indicators, who_drives
 from sb3_chac.cockpit.wrapper import STANDS
 
 needs_chromium = pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium")
@@ -134,7 +136,7 @@ def test_the_printed_address_can_be_used_elsewhere(host, scheme):
 )
 def test_what_is_said_of_who_drives(display, is_manned, watches, driver, takeover, self_learning):
     display = replace(display, novice=Novice("2", True, 0.9))
-    said = dict(indicators(display, 0, is_manned, watches))
+    said = dict(indicators(display, Totals(), 0, is_manned, watches))
     assert who_drives(display, is_manned) == driver
     assert (said["takeover"], said["self-learning"], said["confidence"]) == (takeover, self_learning, "0.90")
 
@@ -171,7 +173,7 @@ def test_collisions_are_counted_once(tmp_path):
     hold(device)
     env, drive, _ = cockpit(tmp_path, device, Bumping())
     env.reset()
-    assert [env.step(NOVICE) and drive.display.collisions for _ in range(7)] == [0, 1, 1, 1, 1, 2, 2]
+    assert [env.step(NOVICE) and drive.totals.collisions for _ in range(7)] == [0, 1, 1, 1, 1, 2, 2]
 
 
 # The guidance meter
@@ -205,8 +207,8 @@ def test_memory_ends():
 
 def test_a_person_who_drives_is_not_asked():
     display = Display(novice=Novice("1", risk=0.97, asks=True))
-    assert dict(indicators(display, 0))["risk"] == "HELP 97%" and asks_for_help(display, "novice")
-    assert dict(indicators(replace(display, takeover=True), 0))["risk"] == "97%"
+    assert dict(indicators(display, Totals(), 0))["risk"] == "HELP 97%" and asks_for_help(display, "novice")
+    assert dict(indicators(replace(display, takeover=True), Totals(), 0))["risk"] == "97%"
 
 
 # The page
@@ -250,7 +252,7 @@ CHECK = """() => {
 @pytest.fixture
 def served(tmp_path, monkeypatch):
     monkeypatch.setattr(server_module, "HEARTBEAT", None)
-    monkeypatch.setattr(server_module, "PATIENCE", FOREVER)
+    monkeypatch.setattr(access, "PATIENCE", FOREVER)
     monkeypatch.setattr(server_module, "MOST_MESSAGES", 10**9)  # within a second of its clock, which may stand still
     drive = Served(tmp_path)
     yield drive
@@ -276,7 +278,7 @@ def opened(browser, served, **context):
     page = opened.new_page()
     page.on("console", lambda message: complaints.append(message.text) if message.type == "error" else None)
     page.on("pageerror", lambda error: complaints.append(str(error)))
-    page.goto(served.server.url(served.server.driver_token))
+    page.goto(served.server.access.url(served.server.access.driver_token))
     shows(page, "role", "You are at the wheel")
     yield page
     opened.close()
@@ -302,7 +304,8 @@ def test_nothing_overlaps_or_leaves_the_view_in_any_size(served, all_sizes):
                 "viewport": dict(zip(("width", "height"), sizes[0], strict=True)),
             }
             with opened(browser, served, **context) as page:
-                served.drive.show(novice=novice, speed=33.3, route=1.0, episode=12_345, **numbers)
+                served.drive.show(novice=novice, speed=33.3, route=1.0)
+                served.drive.count(episode=12_345, **numbers)
                 shows(page, "total-step-value", "1234567")
                 for width, height in sizes:
                     page.set_viewport_size({"width": width, "height": height})
@@ -367,7 +370,7 @@ def test_two_thumbs_drive_and_a_collision_is_felt(served):
         wait_until(lambda: served.drive.paused)
         seen = "window.flashes = 0; new MutationObserver(() => { window.flashes++; }).observe(view, {attributes: true});"
         page.evaluate(f"() => {{ const view = document.getElementById('view'); {seen} }}")
-        served.drive.show(collisions=served.drive.display.collisions + 1)
+        served.drive.count(collisions=served.drive.totals.collisions + 1)
         wait_until(lambda: page.evaluate("window.vibrated === 200 && window.flashes >= 2"))  # it came and went
 
 

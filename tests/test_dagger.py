@@ -11,7 +11,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from takeover_toys import EXPERT, DictIntegrator, constant
 
 from sb3_chac import IWR, HGDagger, InterventionWrapper
-from sb3_chac.common.demonstrations import DatasetError, Demonstrations
+from sb3_chac.common.demonstrations import Demonstrations
+from sb3_chac.common.minari_datasets import DatasetError
 from sb3_chac.iwr.iwr import class_weights
 
 each_algorithm = pytest.mark.parametrize("algorithm", [HGDagger, IWR])

@@ -12,7 +12,8 @@ from eleven import GUIDED, OFFLINE, Walk, demonstrations, make_any
 from guided_toys import column
 
 from sb3_chac.common.buffers import DualReplayBuffer
-from sb3_chac.common.demonstrations import DatasetError, load_demonstrations
+from sb3_chac.common.demonstrations import load_demonstrations
+from sb3_chac.common.minari_datasets import DatasetError
 from sb3_chac.datasets.recording import record
 
 LENGTH = 6

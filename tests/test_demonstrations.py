@@ -25,7 +25,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecTransposeImage
 from torch.utils import _pytree
 
 from sb3_chac.cli.demos import main as command
-from sb3_chac.common.demonstrations import DatasetError, Demonstrations, load_demonstrations
+from sb3_chac.common.demonstrations import Demonstrations, load_demonstrations
+from sb3_chac.common.minari_datasets import DatasetError
 from sb3_chac.datasets.recording import WatchedEnv, record
 from sb3_chac.human import InterventionWrapper, TakeoverRule
 

@@ -78,3 +78,10 @@ def test_results_name_no_path_of_a_machine():
     texts = [path for path in texts if "models" not in path.parts]  # not committed
     found = re.compile(r"(?<![\w.])/(root|home|Users|tmp|work)/")
     assert texts and not [page_id(path) for path in texts if found.search(path.read_text(encoding="utf-8"))]
+
+
+def test_every_benchmark_is_in_the_readme_and_in_make_bench():
+    scripts = {path.name for path in (ROOT / "benchmarks").glob("*.py") if '__name__ == "__main__"' in path.read_text()}
+    bench = (ROOT / "Makefile").read_text().partition("\nbench:")[2].partition("\n\n")[0]
+    for text in (bench, (ROOT / "benchmarks" / "README.md").read_text(encoding="utf-8")):
+        assert scripts <= set(re.findall(r"benchmarks/(\w+\.py)", text))

@@ -314,11 +314,11 @@ def test_rules_can_be_configured():
     assert isinstance(rule, RiskRule) and (rule.take_over_below, rule.hold, rule.hand_back_above) == (1.8, 3, 2.0)
     assert make_rule("disagreement", env, constant, {"threshold": 0.7}).threshold == 0.7
     wrapped = InterventionWrapper(env, rule="risk", rule_kwargs={"hold": 4}, armed=True)
-    assert wrapped.get_wrapper_attr("_rule").hold == 4
+    assert wrapped.get_wrapper_attr("_supervisor").rule.hold == 4
     wrapped.reset(seed=0)
     wrapped.set_rule("never")
     wrapped.set_rule()
-    assert wrapped.get_wrapper_attr("_rule").hold == 4
+    assert wrapped.get_wrapper_attr("_supervisor").rule.hold == 4
     with pytest.raises(ValueError, match=r"^rule_kwargs: .*do not fit rule='risk'.*holds"):
         InterventionWrapper(env, rule_kwargs={"holds": 4})
     with pytest.raises(ValueError, match=r"^hold must be"):
@@ -366,7 +366,7 @@ def not_in_time(*args):
 @pytest.mark.parametrize("algorithm", [PVP, DPVP, CHAC, HGDagger, IWR])
 def test_who_fails_is_named_and_the_model_can_be_saved(tmp_path, monkeypatch, algorithm, expert, rule, error, problem):
     asleep.clear()
-    monkeypatch.setattr("sb3_chac.human.experts.queue.SimpleQueue", Answers)
+    monkeypatch.setattr("sb3_chac.human.supervisor.queue.SimpleQueue", Answers)
     env = InterventionWrapper(Integrator(), expert=expert, rule=rule, deadline=0.2)
     model = algorithm("MlpPolicy", env, buffer_size=50, policy_kwargs={"net_arch": [8]})
     if algorithm in (HGDagger, IWR):

@@ -13,7 +13,8 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_chac import GAIL
-from sb3_chac.common.demonstrations import DatasetError, Demonstrations
+from sb3_chac.common.demonstrations import Demonstrations
+from sb3_chac.common.minari_datasets import DatasetError
 from sb3_chac.gail.discriminator import Discriminator, discriminator_loss, imitation_rewards
 
 LOW, HIGH = np.array([-1.0, 0.0], np.float32), np.array([1.0, 10.0], np.float32)

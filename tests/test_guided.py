@@ -56,7 +56,7 @@ def test_takeovers_are_stored_as_they_happened(algorithm, script):
     def scaled(action):
         return 2 * (np.array(action) - low) / (high - low) - 1
 
-    executed, proposed = wrapper(model).unwrapped.executed, wrapper(model).get_wrapper_attr("_rule").proposed
+    executed, proposed = wrapper(model).unwrapped.executed, wrapper(model).get_wrapper_attr("_supervisor").rule.proposed
     taken = np.array(bits(script))
     assert np.allclose(column(novice, "action"), scaled(executed)[~taken].reshape(-1, 2), atol=1e-6)
     assert np.allclose(column(human, "action"), scaled(EXPERT), atol=1e-6)
@@ -95,7 +95,7 @@ def test_several_environments(algorithm):
     assert column(human, "reward").tolist() == [1, 2, 3, 4]  # the step, in the order of the steps
     assert column(human, "takeover_start").tolist() == [1, 1, 0, 1]
     assert len(novice) == 8
-    proposed = [wrapper(model, idx).get_wrapper_attr("_rule").proposed for idx in range(3)]
+    proposed = [wrapper(model, idx).get_wrapper_attr("_supervisor").rule.proposed for idx in range(3)]
     expected = [proposed[idx][t] for t, idx in ((0, 1), (1, 0), (2, 0), (3, 1))]
     assert np.allclose(column(human, "novice_action"), expected, atol=1e-6)
     assert model.counts["human_steps"] == 4 and model.counts["total_steps"] == 12

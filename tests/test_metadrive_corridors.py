@@ -5,7 +5,7 @@ import pytest
 
 from sb3_chac.envs.driving.corridors import N_CORRIDORS, N_VIEW, Corridors
 from sb3_chac.envs.metadrive import MetaDriveSafetyEnv
-from sb3_chac.envs.metadrive.env import LIDAR_REACH, N_LIDAR, OFFSET, ROUTE, SCALE, STRIPS, route_ahead
+from sb3_chac.envs.metadrive.observation import LIDAR_REACH, N_LIDAR, OFFSET, ROUTE, SCALE, STRIPS, route_ahead
 
 needs_metadrive = pytest.mark.skipif(
     importlib.util.find_spec("metadrive") is None,

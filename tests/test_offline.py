@@ -17,8 +17,10 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_chac.bc import BC
 from sb3_chac.bc.policies import gaussian_nll, squared_errors
-from sb3_chac.common.checkpoints import ResumableCheckpoint, newest_checkpoint
-from sb3_chac.common.demonstrations import DatasetError, Demonstrations
+from sb3_chac.common.checkpoint_files import newest_checkpoint
+from sb3_chac.common.checkpoints import ResumableCheckpoint
+from sb3_chac.common.demonstrations import Demonstrations
+from sb3_chac.common.minari_datasets import DatasetError
 from sb3_chac.common.offline import DatasetSampler
 from sb3_chac.cql import CQL
 from sb3_chac.cql.cql import conservative_gap

@@ -19,13 +19,9 @@ from stable_baselines3.common.save_util import load_from_pkl
 from sb3_chac import CHAC, DPVP, DSAC
 from sb3_chac.cli.plot import read_progress
 from sb3_chac.cli.resume import main as resume
-from sb3_chac.common.checkpoints import (
-    ResumableCheckpoint,
-    SparseWriter,
-    checkpoint_step,
-    checkpoints,
-    newest_checkpoint,
-)
+from sb3_chac.common.checkpoint_files import checkpoint_step, checkpoints, newest_checkpoint
+from sb3_chac.common.checkpoints import ResumableCheckpoint
+from sb3_chac.common.files import SparseWriter
 from sb3_chac.envs.safedrive import SafeDriveEnv
 from sb3_chac.zoo.runs import find_training, steps
 

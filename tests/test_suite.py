@@ -19,7 +19,7 @@ import suite_job  # noqa: E402
 import suite_report  # noqa: E402
 from suite_job import Job, Outcome  # noqa: E402
 
-from sb3_chac.common.checkpoints import newest_checkpoint, sound_checkpoint  # noqa: E402
+from sb3_chac.common.checkpoint_files import newest_checkpoint, sound_checkpoint  # noqa: E402
 
 ROWS = {row.name: row for row in suite.ROWS}
 

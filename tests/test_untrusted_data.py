@@ -15,7 +15,7 @@ from gymnasium.envs.registration import EnvSpec
 
 from sb3_chac.cli.demos import main as demos
 from sb3_chac.cockpit.recording import ABOUT, FOLDER, CrashSafeRecorder, finish_recording
-from sb3_chac.common.demonstrations import open_dataset
+from sb3_chac.common.minari_datasets import open_dataset
 from sb3_chac.datasets.recording import record
 from sb3_chac.evaluation.episodes import NotEvaluable, check_names_no_code, registered_spec
 

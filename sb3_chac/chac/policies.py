@@ -16,7 +16,7 @@ CONTROLS = ("guided", "self", "shared")
 
 
 class Choice(NamedTuple):
-    """What shared control decided in each of ``batch_size`` states."""
+    """Decisions of shared control in ``batch_size`` states."""
 
     actions: th.Tensor  # executed, shape (batch_size, action_dim)
     self_drives: th.Tensor  # whether they are pi_r's, shape (batch_size,), as all below

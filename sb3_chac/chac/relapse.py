@@ -17,7 +17,7 @@ class Score(NamedTuple):
 
 class RelapseWatch:
     """
-    Whether stage 2 forgets what was learned before, judged by the scores of the training's episodes.
+    Watch over stage 2: tells from the scores of the training's episodes if it forgets what was learned before.
 
     The latest ``window`` episodes of stage 1 are the first best. In stage 2, the mean of every ``window`` episodes is compared
     with the best so far: it is the new best if it is higher, and a relapse if it is lower by more than ``N_ERRORS`` standard
@@ -66,7 +66,7 @@ class RelapseWatch:
         return self.relapsed and not before
 
     def restore(self, policy: th.nn.Module) -> None:
-        """The policy is the best one again."""
+        """Make the policy the best one again."""
         policy.load_state_dict(self.best_parameters)
         self.relapsed = False
         self.scores.clear()

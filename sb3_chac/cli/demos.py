@@ -14,7 +14,8 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_chac.cli.arguments import check_output, parse_env_kwargs
 from sb3_chac.cli.command import run_command
-from sb3_chac.common.demonstrations import DatasetError, load_demonstrations, open_dataset
+from sb3_chac.common.demonstrations import load_demonstrations
+from sb3_chac.common.minari_datasets import DatasetError, open_dataset
 from sb3_chac.datasets.recording import WatchedEnv, record
 from sb3_chac.datasets.replay import Replay
 from sb3_chac.datasets.writer import SETTINGS

@@ -193,7 +193,7 @@ def check_numbers(args: argparse.Namespace) -> None:
 
 def check_arguments(args: argparse.Namespace) -> None:
     """
-    Also fills in what was left open.
+    Check the command line, and fill in what was left open.
 
     :raises NotDrivable: for what does not fit
     """
@@ -201,7 +201,7 @@ def check_arguments(args: argparse.Namespace) -> None:
     import numpy as np
 
     import sb3_chac.envs  # noqa: F401
-    from sb3_chac.cockpit.devices.browser import parse_address
+    from sb3_chac.cockpit.address import parse_address
     from sb3_chac.datasets.writer import folder_to_make
     from sb3_chac.zoo.algorithms import drivable_algorithms
 

@@ -93,7 +93,7 @@ def main(arguments: list[str]) -> None:
 
 class Request(NamedTuple):
     """
-    What a command line asks for, checked.
+    Checked request of a command line.
 
     :param policy: model, or name of an expert
     :param env: id of the environment

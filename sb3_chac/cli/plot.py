@@ -35,7 +35,7 @@ class NotPlottable(NotEvaluable):
 
 
 class Panel(NamedTuple):
-    """How a curve is drawn."""
+    """Titles and colour of the panel of a curve."""
 
     title: str
     subtitle: str

@@ -14,7 +14,7 @@ from rl_zoo3.utils import ALGOS
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_chac.cockpit.devices import Device
-from sb3_chac.cockpit.learner import DrivenTraining, driven
+from sb3_chac.cockpit.driven import DrivenTraining, driven
 from sb3_chac.cockpit.person import NotDrivable, Person, check_drivable
 from sb3_chac.cockpit.recording import CrashSafeRecorder, Summary
 from sb3_chac.cockpit.session import Session
@@ -29,7 +29,7 @@ DEFAULT_RATE = 10.0  # [1/s]
 
 class EpisodeCheckpoint(ResumableCheckpoint):
     """
-    Writes them at the beginning of an episode, when nobody is driving at speed.
+    Checkpoints at the beginnings of episodes, when nobody is driving at speed.
 
     :param cockpit: tells when that is
     """
@@ -106,6 +106,7 @@ class CockpitRun:
 
     @property
     def is_over(self) -> bool:
+        """Tell whether the driving thread has ended."""
         return not self.thread.is_alive()
 
     def _run(self) -> None:

@@ -1,42 +1,21 @@
 """Training that goes on beside the driving: gradient steps in a thread of their own."""
 
-import copy
-import functools
 import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-import numpy as np
-import torch as th
-from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.logger import Logger
-from stable_baselines3.common.noise import ActionNoise
-from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import MaybeCallback
-
-from sb3_chac.chac import CHAC
-from sb3_chac.cockpit.meter import GuidanceMeter
-from sb3_chac.cockpit.session import Novice, Session, SessionEnded
-from sb3_chac.common.critics import DistributionalCritic
-from sb3_chac.common.guided import GuidedOffPolicyAlgorithm
-from sb3_chac.hg_dagger import HGDagger
+from sb3_chac.cockpit.session import Session
 
 if TYPE_CHECKING:
-    Base = GuidedOffPolicyAlgorithm
-else:
-    Base = object
-
-
-LOW = -1.2816  # the 10 % quantile of the normal distribution
+    from sb3_chac.cockpit.driven import DrivenTraining
 
 
 class Learner(threading.Thread):
     """
-    Makes the gradient steps that a model owes, in their order and number, one at a time. It leaves the moment of the next
-    step of the environment to the driver.
+    Thread that makes the gradient steps that a model owes, in their order and number, one at a time. It leaves the moment of
+    the next step of the environment to the driver.
 
     :param model: that learns
     :param drive: beside which it learns
@@ -65,7 +44,7 @@ class Learner(threading.Thread):
 
     def drain(self) -> None:
         """
-        Returns when nothing is owed.
+        Wait until nothing is owed.
 
         :raises BaseException: what a gradient step has raised
         """
@@ -76,12 +55,12 @@ class Learner(threading.Thread):
 
     @contextmanager
     def resting(self) -> Iterator[None]:
-        """The networks do not change inside the block."""
+        """Keep the networks as they are inside the block."""
         with self._working:
             yield
 
     def stop(self) -> None:
-        """Returns when the gradient step that is under way is made. What is owed stays so."""
+        """Stop once the gradient step that is under way is made. What is owed stays so."""
         with self._changed:
             self._stopped = True
             self._changed.notify_all()
@@ -115,294 +94,3 @@ class Learner(threading.Thread):
     def _raise_error(self) -> None:
         if self.error is not None:
             raise self.error
-
-
-class DrivenTraining(Base):
-    """
-    Makes an algorithm fit for a drive: see ``driven``.
-
-    ``train`` only says how many gradient steps are due; a ``Learner`` makes them. Who drives is a copy of the policy, brought
-    up to date after each gradient step, so that no step of the environment waits for one. What takes long and is to
-    happen between two steps (C-HAC's fit at the beginning of stage 2, the rounds of HG-DAgger and IWR) is done where the
-    algorithm does it: the car waits, and the display says so.
-    """
-
-    drive: Session
-    owed_steps = 0  # gradient steps; saved, so that they are made after a restart
-    driven_seconds = 0.0
-
-    def attach(self, drive: Session) -> None:
-        """
-        To be called before ``learn``.
-
-        :param drive: in whose environment it learns
-        :raises ValueError: for what cannot be done in a drive
-        """
-        if self.use_sde:
-            raise ValueError("use_sde: a drive needs use_sde=False, generalised exploration is not supported in the cockpit.")
-        self.drive = drive
-        self.learner = Learner(self, drive)
-        self._this_thread = threading.local()
-        self._buffer_lock = threading.Lock()
-        self._driving_lock = threading.Lock()  # held while the driving policy acts or is refreshed
-        self._learner_logger = Logger(None, [])
-        self._meter = GuidanceMeter(drive.query)
-        self._driving_policy = copy.deepcopy(self._learning_policy)
-        self._pairs = tuple(
-            [*policy.parameters(), *policy.buffers()] for policy in (self._driving_policy, self._learning_policy)
-        )
-        drive.show(seconds=self.driven_seconds, total_steps=int(self.counts["total_steps"]))
-        drive.show(human_steps=int(self.counts["human_steps"]))
-        self._tell()
-
-    # Two policies and two loggers: each thread has its own
-
-    @property
-    def policy(self) -> Any:
-        acts = "_this_thread" in self.__dict__ and getattr(self._this_thread, "acts", False)
-        return self._driving_policy if acts else self._learning_policy
-
-    @policy.setter
-    def policy(self, policy: BasePolicy) -> None:
-        self._learning_policy = policy
-
-    @property
-    def logger(self) -> Logger:
-        if "learner" in self.__dict__ and threading.current_thread() is self.learner:
-            return self._learner_logger
-        return self._logger
-
-    def dump_logs(self) -> None:
-        if "learner" in self.__dict__:
-            for name, value in dict(self._learner_logger.name_to_value).items():
-                self._logger.record(name, value)
-            self._logger.record("time/owed_gradient_steps", self.owed_steps)
-        super().dump_logs()
-
-    @th.no_grad()
-    def refresh_driver(self) -> None:
-        """The driving policy becomes what was learned."""
-        with self._driving_lock:
-            th._foreach_copy_(self._pairs[0], self._pairs[1])
-
-    # Learning
-
-    def train(self, gradient_steps: int, batch_size: int = 64) -> None:
-        self.learner.owe(gradient_steps)
-        self.drive.lag = self.owed_steps
-
-    def train_now(self, gradient_steps: int, batch_size: int) -> None:
-        """The algorithm's own ``train``."""
-        super().train(gradient_steps, batch_size)
-
-    def pretrain(self, gradient_steps: int) -> None:
-        """
-        Gradient steps on what the replay buffer holds, before the drive begins.
-
-        :param gradient_steps: number
-        """
-        self._setup_learn(0)  # makes the logger, the learner begins
-        self._update_current_progress_remaining(0, 1)
-        self.learner.owe(gradient_steps)
-        self.learner.drain()
-
-    def _sample_batch(self, batch_size: int) -> Any:
-        with self._buffer_lock:
-            return super()._sample_batch(batch_size)  # type: ignore[misc]
-
-    # Driving
-
-    @property
-    def stage_name(self) -> str:
-        return "guided"
-
-    def _sample_action(
-        self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
-    ) -> tuple[np.ndarray, np.ndarray]:
-        with self._driving_lock:
-            self._this_thread.acts = True
-            try:
-                sampled = super()._sample_action(learning_starts, action_noise, n_envs)
-                self._tell(sampled[1])
-            finally:
-                self._this_thread.acts = False
-        return sampled
-
-    def _tell(self, actions: np.ndarray | None = None) -> None:
-        """
-        What the display shows of the novice.
-
-        :param actions: that it is about to do, scaled to [-1, 1], shape (1, 2)
-        """
-        choice = getattr(self.policy, "last_choice", None)
-        risk = self._meter.tell(None if actions is None else self._foreseen(actions))
-        self.drive.novice = Novice(
-            self.stage_name,
-            None if choice is None else bool(choice.self_drives[0]),
-            None if choice is None else float(choice.confidence[0]),
-            risk,
-            self._meter.asks,
-        )
-        self.drive.show(novice=self.drive.novice)
-
-    @th.no_grad()
-    def _foreseen(self, actions: np.ndarray) -> float | None:
-        """
-        The value that the guidance meter ranks.
-
-        Z_c's, which knows of the takeovers to come, where there is one: on maps not seen before, its low values foresee a
-        takeover within three steps with an area under the ROC curve of about .77, those of Z_g hardly
-        (``benchmarks/foresight.py``).
-
-        :param actions: scaled to [-1, 1], shape (1, 2)
-        :return: Q_c, else the 10 % quantile of Z_g (PVP: the smaller Q_g), of the action in the present state; None before the
-            first gradient step, and for algorithms without any of them
-        """
-        critic = getattr(self.policy, "critic", None)
-        if critic is None or not self._n_updates:
-            return None
-        assert self._last_obs is not None
-        obs, _ = self.policy.obs_to_tensor(self._last_obs)
-        action = th.as_tensor(actions, dtype=th.float32, device=self.device)
-        if isinstance(self, CHAC):
-            return float(self.policy.confidence_critic.pessimistic(obs, action)[0])
-        if isinstance(critic, DistributionalCritic):
-            mean, std = critic.pessimistic(obs, action)
-            return float(mean[0] + LOW * std[0])
-        return min(float(q_value[0]) for q_value in critic(obs, action))
-
-    def _store_transition(
-        self,
-        replay_buffer: ReplayBuffer,
-        buffer_action: np.ndarray,
-        new_obs: np.ndarray | dict[str, np.ndarray],
-        reward: np.ndarray,
-        dones: np.ndarray,
-        infos: list[dict[str, Any]],
-    ) -> None:
-        if infos[0].get("unattended"):  # nobody's decision: nothing is to be learned from it
-            self.replay_buffer.end_trajectories()
-            self._forget_episodes()
-            self._last_obs = new_obs
-            return
-        with self._buffer_lock:
-            super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
-        self.driven_seconds = self.drive.display.seconds
-
-    def _setup_learn(
-        self,
-        total_timesteps: int,
-        callback: MaybeCallback = None,
-        reset_num_timesteps: bool = True,
-        tb_log_name: str = "run",
-        progress_bar: bool = False,
-    ) -> tuple[int, BaseCallback]:
-        prepared = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
-        self._callback = prepared[1]
-        self.refresh_driver()
-        if not self.learner.is_alive():
-            self.learner.start()
-        return prepared
-
-    def learn(self, *args: Any, **kwargs: Any) -> Any:
-        """
-        As the algorithm's, but it returns early when the person quits. Everything driven is stored then.
-        """
-        try:
-            super().learn(*args, **kwargs)
-            self.drive.busy = "The last gradient steps are made" if self.owed_steps else ""
-            self.learner.drain()
-        except SessionEnded:
-            self._callback.on_training_end()
-        finally:
-            self.drive.busy = ""
-            self.learner.stop()
-        return self
-
-    def _excluded_save_params(self) -> list[str]:
-        own = ["drive", "learner", "_this_thread", "_buffer_lock", "_driving_lock", "_learner_logger", "_driving_policy"]
-        return [*super()._excluded_save_params(), *own, "_pairs", "_learning_policy", "_callback"]
-
-    def save(self, *args: Any, **kwargs: Any) -> None:
-        """As SB3's, between two gradient steps."""
-        with self.learner.resting():
-            super().save(*args, **kwargs)
-
-
-class DrivenStages(DrivenTraining):
-    """
-    ``DrivenTraining`` of C-HAC: the fit of Z_c at the end of stage 1 is made beside the driving, too. Stage 1 goes on until it
-    is done. Who sits at the wheel may take over in stage 2 as well.
-    """
-
-    steps_before_prefit = 0  # gradient steps that were owed when it was due
-    prefit_left: int | None = None  # None: it is not due
-
-    def train_now(self, gradient_steps: int, batch_size: int) -> None:
-        if not self.prefit_left:
-            super().train_now(gradient_steps, batch_size)
-        elif self.steps_before_prefit:
-            super().train_now(gradient_steps, batch_size)
-            self.steps_before_prefit -= 1
-        else:
-            self._prefit_step()  # type: ignore[attr-defined]
-            self.prefit_left -= 1
-
-    def _start_stage_2(self) -> None:
-        """Is called after each step of the environment as long as it is due."""
-        if self.prefit_left is None:
-            self.steps_before_prefit, self.prefit_left = self.owed_steps, self.prefit_steps  # type: ignore[attr-defined]
-            self.learner.owe(self.prefit_steps)  # type: ignore[attr-defined]
-        if self.prefit_left == 0:
-            with self.learner.resting():
-                self._switch_to_stage_2()  # type: ignore[attr-defined]
-            self.refresh_driver()
-            self._arm()
-
-    def _needs_human(self) -> bool:
-        return True
-
-    @property
-    def stage_name(self) -> str:
-        if self.stage == 2:  # type: ignore[attr-defined]
-            watch = self.watch  # type: ignore[attr-defined]
-            return "2: RELAPSE" if watch is not None and watch.relapsed else "2: self-learning"
-        return "1: guided" if self.prefit_left is None else "1: prepares 2"
-
-
-class DrivenRounds(DrivenTraining):
-    """
-    ``DrivenTraining`` of HG-DAgger and IWR: the novice is fitted between the rounds, where the algorithm does it. The car
-    waits meanwhile, and the display says so.
-    """
-
-    def train(self, gradient_steps: int, batch_size: int = 64) -> None:
-        assert isinstance(self, HGDagger)
-        if self._is_round_over() or self.num_timesteps >= self._total_timesteps:
-            self.drive.busy = "The car waits: the novice is fitted to what you drove"
-            try:
-                with self.learner.resting():
-                    self.train_now(gradient_steps, batch_size)
-                self.refresh_driver()
-            finally:
-                self.drive.busy = ""
-
-    @property
-    def stage_name(self) -> str:
-        assert isinstance(self, HGDagger)
-        return f"round {self.round}" if self.round else "warm-up"
-
-
-@functools.cache
-def driven(algorithm: type[GuidedOffPolicyAlgorithm]) -> type[Any]:
-    """
-    Derive the class of an algorithm that learns while a person drives.
-
-    :param algorithm: that learns from takeovers
-    :return: the same algorithm for a drive, see ``DrivenTraining``; what it saves is the algorithm's
-    """
-    base = DrivenTraining
-    for special, general in ((DrivenStages, CHAC), (DrivenRounds, HGDagger)):
-        if issubclass(algorithm, general):
-            base = special
-    return type(f"Driven{algorithm.__name__}", (base, algorithm), {})

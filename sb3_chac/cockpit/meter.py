@@ -9,8 +9,8 @@ CALM = 10  # steps below the threshold after which help is no longer asked for
 
 class GuidanceMeter:
     """
-    Turns values of a critic into a risk from 0 to 1: the share of the last ``memory`` values that were higher. They have no
-    scale of their own (it depends on how often a person took over, and for what), their order is what they tell.
+    Meter that turns values of a critic into a risk from 0 to 1: the share of the last ``memory`` values that were higher. They
+    have no scale of their own (it depends on how often a person took over, and for what), their order is what they tell.
 
     With a threshold it asks for help as soon as the risk reaches it, until ``CALM`` steps in a row were below.
 

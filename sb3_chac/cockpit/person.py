@@ -8,6 +8,7 @@ import numpy as np
 from gymnasium import spaces
 
 from sb3_chac.cockpit.devices import Command, Device, DriverInput
+from sb3_chac.common.contract import scale_action
 
 
 class NotDrivable(ValueError):
@@ -34,7 +35,7 @@ def check_drivable(env: gym.Env) -> None:
 
 class Person:
     """
-    Turns what a device says into actions. ``InterventionWrapper`` takes it as its expert and ``drives`` as its rule. Events
+    Person whose device says what to do. ``InterventionWrapper`` takes it as its expert and ``drives`` as its rule. Events
     come from the thread of the window or the server, ``look`` from the one that drives.
 
     :param device: that the person holds
@@ -53,7 +54,7 @@ class Person:
         :param box: action space, shape (2,): steering, then throttle (its upper bound) or brake (its lower bound)
         :param steers_left: whether the greatest first action is fully to the left
         """
-        self._low, self._high, self.steers_left = box.low.astype(float), box.high.astype(float), steers_left
+        self._box, self.steers_left = box, steers_left
 
     def handle(self, event: Any) -> Command | None:
         """
@@ -66,17 +67,17 @@ class Person:
             return self.device.handle(event)
 
     def look(self) -> DriverInput:
-        """What the person wants in the step that is about to be made."""
+        """Note and return what the person wants in the step that is about to be made."""
         self.input = self.read()
         return self.input
 
     def read(self) -> DriverInput:
-        """What the person wants now."""
+        """Return what the person wants now."""
         with self.lock:
             return self.device.read()
 
     def hand_back(self) -> None:
-        """Ends the takeover, if there is one."""
+        """End the takeover, if there is one."""
         with self.lock:
             self.device.hand_back()
 
@@ -103,7 +104,8 @@ class Person:
         :return: the action in the units of the environment, shape (2,)
         """
         scaled = np.array([-steering if self.steers_left else steering, pedals])
-        return self._low + (scaled + 1) / 2 * (self._high - self._low)
+        low, high = self._box.low.astype(float), self._box.high.astype(float)
+        return low + (scaled + 1) / 2 * (high - low)
 
     def as_input(self, action: np.ndarray) -> tuple[float, float]:
         """
@@ -112,7 +114,7 @@ class Person:
         :param action: in the units of the environment, shape (2,)
         :return: steering (-1 left to 1 right) and pedals (-1 brake to 1 throttle)
         """
-        steering, pedals = 2 * (np.asarray(action, float) - self._low) / (self._high - self._low) - 1
+        steering, pedals = scale_action(action, self._box)
         return float(-steering if self.steers_left else steering), float(pedals)
 
     # Expert and rule

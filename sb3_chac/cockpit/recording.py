@@ -1,7 +1,6 @@
-"""What was driven, as a dataset in Minari's format and a summary. Each episode is on the disk as soon as it ends."""
+"""Recording of a drive: a dataset in Minari's format and a summary. Each episode is on the disk as soon as it ends."""
 
 import json
-import os
 import shutil
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -11,8 +10,9 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.envs.registration import EnvSpec
 
-from sb3_chac.common.checkpoints import sync
-from sb3_chac.common.demonstrations import DatasetError, check_spaces
+from sb3_chac.common.demonstrations import check_spaces
+from sb3_chac.common.files import sync, write_safely
+from sb3_chac.common.minari_datasets import DatasetError
 from sb3_chac.datasets.recording import Recorder as EpisodeRecorder
 from sb3_chac.datasets.writer import DatasetWriter, folder_to_make, storable_spec
 
@@ -27,7 +27,7 @@ SUMMARY = "summary.json"
 @dataclass(frozen=True)
 class Summary:
     """
-    What a person did in a drive.
+    Summary of what a person did in a drive.
 
     :param dataset: folder of the dataset, None if nothing was driven
     :param episodes: number of episodes, the last may be cut off
@@ -71,8 +71,8 @@ class Summary:
 
 class CrashSafeRecorder:
     """
-    Writes each episode into a file of its own once it ends; ``finish`` makes the dataset of them. What a process that was
-    killed has left, ``finish_recording`` makes a dataset of later.
+    Recorder that writes each episode into a file of its own once it ends; ``finish`` makes the dataset of them. What a process
+    that was killed has left, ``finish_recording`` makes a dataset of later.
 
     :param folder: of the run
     :param env: what is recorded, its spaces and how it is made
@@ -106,7 +106,7 @@ class CrashSafeRecorder:
 
     def begin(self, observation: np.ndarray, seed: int, options: dict[str, Any] | None) -> None:
         """
-        A new episode; one that is under way ends.
+        Begin a new episode; one that is under way ends.
 
         :param observation: the first
         """
@@ -138,7 +138,7 @@ class CrashSafeRecorder:
             self.end()
 
     def end(self) -> None:
-        """Ends the episode that is under way, if there is one; where it did not end itself, it is cut off (truncated)."""
+        """End the episode that is under way, if there is one; where it did not end itself, it is cut off (truncated)."""
         steps, self._steps = self._steps, []
         if not steps:
             return
@@ -178,7 +178,7 @@ def finish_recording(run_folder: Path) -> Summary | None:
 
 class RecordedEnv(gym.Env):
     """
-    What is known of an environment that was recorded, to be written down. It is never made: a file runs no code.
+    Description of an environment that was recorded, to be written down. It is never made: a file runs no code.
 
     :param about: what ``CrashSafeRecorder`` has written
     :raises DatasetError: if that is damaged
@@ -253,15 +253,3 @@ def _summary(episodes: list[dict[str, np.ndarray]], dataset: Path | None, second
         successes=sum(bool(episode["info/is_success"][-1]) for episode in episodes) if tell_success else None,
         seconds=steps * seconds_per_step,
     )
-
-
-def write_safely(file: Path, content: bytes) -> None:
-    """
-    Replace a file in one go.
-
-    :param file: holds what it held before, or all of ``content``, whenever the process is killed
-    """
-    temporary = file.with_name(file.name + ".tmp")
-    temporary.write_bytes(content)
-    sync(temporary)
-    os.replace(temporary, file)

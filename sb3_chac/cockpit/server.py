@@ -1,21 +1,16 @@
 """
 The cockpit for a browser: the page, the pictures and what the driver does, over one WebSocket per viewer.
 
-Who may connect: only who has the access token of this drive, from a page that this server has sent. See ``Server``.
+Who may connect: only who has the access token of this drive, from a page that this server has sent. See ``Access``.
 """
 
 import asyncio
-import hmac
 import io
-import logging
-import re
-import secrets
 import signal
-import socket
 import ssl
 import sys
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -29,34 +24,19 @@ try:
 except ImportError as error:
     raise RuntimeError('--serve needs aiohttp and segno: pip install "aiohttp>=3.10" segno.') from error
 
+from sb3_chac.cockpit.access import MOST_CONNECTIONS, Access, Counter
+from sb3_chac.cockpit.address import Address
 from sb3_chac.cockpit.devices import Clock
-from sb3_chac.cockpit.devices.browser import Address, BadMessage, Browser, Held, Wish, is_number, parse
+from sb3_chac.cockpit.devices.browser import BadMessage, Browser, Held, Wish, parse
 from sb3_chac.cockpit.session import Session, asks_for_help, indicators, who_drives
-
-logger = logging.getLogger(__name__)
 
 STATIC = Path(__file__).parent / "static"
 FILES = {"/": "index.html", "/cockpit.js": "cockpit.js", "/cockpit.css": "cockpit.css"}
 MOST_BYTES = 1024  # of a message
 MOST_MESSAGES = 200  # of a viewer in a second, control frames included
-MOST_REQUESTS = 100  # of an address in a second
-MOST_REMARKS = 10  # in the log in a second
 MOST_VIEWERS = 16
-MOST_CONNECTIONS = 64
-PATIENCE = 10.0  # [s] with a connection that asks for nothing
 HEARTBEAT = 5.0  # [s] between two questions whether a viewer is still there
-HOST = re.compile(r"(\[[0-9a-fA-F:.]+\]|[0-9a-zA-Z._-]+)(:[0-9]{1,5})?")
 LOOK, TELL = 0.01, 0.05  # [s] between two looks for a new picture, and between two messages to a viewer at most
-HEADERS = {
-    "X-Content-Type-Options": "nosniff",
-    "Referrer-Policy": "no-referrer",
-    "Cache-Control": "no-store",
-    "X-Frame-Options": "DENY",
-}
-POLICY = (
-    "default-src 'none'; script-src 'self'; style-src 'self'; img-src blob:; connect-src 'self' {socket}://{host}; "
-    "frame-ancestors 'none'; base-uri 'none'; form-action 'none'"
-)
 
 
 class Viewer:
@@ -73,36 +53,12 @@ class Viewer:
         self.shown = -1  # number of the newest picture it was sent
 
 
-class Counter:
-    """
-    How much one viewer, or one address, asks for: too much if it is more than ``most`` within a second.
-
-    :param most: number of requests or messages
-    :param clock: [s]
-    """
-
-    def __init__(self, most: int, clock: Clock) -> None:
-        self.most, self.clock = most, clock
-        self._second, self._count = 0.0, 0
-
-    def is_flooded(self) -> bool:
-        """To be called once for each."""
-        now = self.clock()
-        if now - self._second > 1:
-            self._second, self._count = now, 0
-        self._count += 1
-        return self._count > self.most
-
-
 class Server:
     """
-    Serves the cockpit of a drive.
+    Server of the cockpit of a drive.
 
-    There are two access tokens, one for who may drive and one for who may watch. Nobody gets anything without one, on loopback
-    neither, for others may use the machine. Requests under other host names (DNS rebinding) and WebSockets of other origins
-    are refused, as are messages that the page does not send. One viewer sits at the wheel; it becomes free when that one
-    leaves, and is taken by a click then, not by itself. Limits hold for those without a token, too. Who is refused or dropped
-    is told to the log, without tokens.
+    Who may come in, ``Access`` decides; messages that the page does not send are refused. One viewer sits at the wheel; it
+    becomes free when that one leaves, and is taken by a click then, not by itself.
 
     :param drive: with ``device`` at its wheel
     :param device: of the driver
@@ -119,44 +75,37 @@ class Server:
         tls: ssl.SSLContext | None = None,
         clock: Clock = time.monotonic,
     ) -> None:
-        self.drive, self.device, self.address, self.tls, self.clock = drive, device, address, tls, clock
-        self.driver_token, self.spectator_token = secrets.token_urlsafe(24), secrets.token_urlsafe(24)
-        self._remarks = Counter(MOST_REMARKS, clock)
-        self._requests: dict[str | None, Counter] = {}  # by address
+        self.drive, self.device, self.clock = drive, device, clock
+        self.access = Access(address, tls, clock)
         self.viewers: list[Viewer] = []
         self.driver: Viewer | None = None
         self._picture: tuple[int, bytes] = (-1, b"")
         self._news = asyncio.Event()
-        self._useful: set[Any] = set()  # connections that have asked for something
 
     @asynccontextmanager
     async def listening(self) -> AsyncIterator[None]:
         """
-        Serves inside the block.
+        Serve inside the block.
 
         :raises OSError: if the address cannot be had
         """
-        app = web.Application(middlewares=[self._guard])
+        access = self.access
+        app = web.Application(middlewares=[access.guard])
         app.add_routes([web.get(path, self._file) for path in FILES] + [web.get("/ws", self._websocket)])
-        runner = web.AppRunner(app, access_log=None, keepalive_timeout=PATIENCE, shutdown_timeout=1.0)
+        runner = web.AppRunner(app, access_log=None, keepalive_timeout=access.patience, shutdown_timeout=1.0)
         await runner.setup()
-        http = runner.server
+        http, loop = runner.server, asyncio.get_running_loop()
         assert http is not None
-
-        def connect() -> asyncio.Protocol:
-            return http() if len(http.connections) < MOST_CONNECTIONS else _Refusal()
-
-        loop = asyncio.get_running_loop()
         try:
             listener = await loop.create_server(
-                connect, self.address.host, self.address.port, backlog=MOST_CONNECTIONS, ssl=self.tls
+                lambda: access.admit(http), access.address.host, access.address.port, backlog=MOST_CONNECTIONS, ssl=access.tls
             )
         except OSError as error:
             await runner.cleanup()
             reason = error.strerror or str(error)
-            raise OSError(f"--serve: {self.address.host}:{self.address.port} cannot be served: {reason}.") from error
-        self.address = Address(self.address.host, listener.sockets[0].getsockname()[1])
-        tasks = [asyncio.create_task(self._publish()), asyncio.create_task(self._sweep(http))]
+            raise OSError(f"--serve: {access.address.host}:{access.address.port} cannot be served: {reason}.") from error
+        access.address = Address(access.address.host, listener.sockets[0].getsockname()[1])
+        tasks = [asyncio.create_task(self._publish()), asyncio.create_task(access.sweep(http))]
         try:
             yield
         finally:
@@ -168,77 +117,8 @@ class Server:
                     await asyncio.wait_for(viewer.socket.close(code=WSCloseCode.GOING_AWAY, message=b"The drive is over"), 1)
             await runner.cleanup()
 
-    # Who may come in
-
-    @web.middleware
-    async def _guard(
-        self, request: web.Request, handler: Callable[[web.Request], Awaitable[web.StreamResponse]]
-    ) -> web.StreamResponse:
-        self._useful.add(request.protocol)
-        try:
-            self._check_request(request)
-            response = await handler(request)
-        except web.HTTPException as refusal:
-            refusal.headers.update(HEADERS)
-            self._remark(f"refused {request.path!r:.40} to {request.remote}: {refusal.status} {refusal.text}")
-            raise
-        if not response.prepared:
-            policy = POLICY.format(host=request.host, socket="wss" if self.tls else "ws")
-            response.headers.update({**HEADERS, "Content-Security-Policy": policy})
-        return response
-
-    def _check_request(self, request: web.Request) -> None:
-        """
-        What holds for everybody, whether there is a token or not.
-
-        :raises HTTPException: for too many requests of an address, and for another host name
-        """
-        if len(self._requests) > MOST_CONNECTIONS:
-            self._requests.clear()
-        if self._requests.setdefault(request.remote, Counter(MOST_REQUESTS, self.clock)).is_flooded():
-            raise web.HTTPTooManyRequests(text="Too many requests: wait a second.")
-        found = HOST.fullmatch(request.host)
-        host = found[1].strip("[]").lower() if found else ""
-        own = {"localhost", self.address.host.lower(), socket.gethostname().lower()}
-        if not (host in own or is_number(host)):
-            raise web.HTTPForbidden(text="This host name is not served. Use the address that was printed.")
-
-    def _remark(self, text: str) -> None:
-        """
-        Log a remark, without any token.
-
-        :param text: for the log, without a token
-        """
-        if not self._remarks.is_flooded():
-            logger.warning("cockpit: %s", text)
-
-    @property
-    def scheme(self) -> str:
-        return "https" if self.tls else "http"
-
-    def url(self, token: str) -> str:
-        """
-        Build the address of the page.
-
-        :param token: one of the two
-        """
-        return self.address.from_elsewhere().url(token, self.scheme)
-
-    def _may_drive(self, request: web.Request) -> bool:
-        """
-        Tell whether a request may drive or only watch.
-
-        :raises HTTPForbidden: if it may not even watch
-        """
-        token = request.query.get("token", "").encode()
-        if hmac.compare_digest(token, self.driver_token.encode()):
-            return True
-        if hmac.compare_digest(token, self.spectator_token.encode()):
-            return False
-        raise web.HTTPForbidden(text="The access token is missing or wrong. Use the address that was printed.")
-
     async def _file(self, request: web.Request) -> web.StreamResponse:
-        self._may_drive(request)
+        self.access.may_drive(request)
         if request.path != "/":
             return web.FileResponse(STATIC / FILES[request.path])
         page = (STATIC / FILES["/"]).read_text()
@@ -247,9 +127,8 @@ class Server:
         return web.Response(text=page, content_type="text/html")
 
     async def _websocket(self, request: web.Request) -> web.StreamResponse:
-        if request.headers.get("Origin") != f"{self.scheme}://{request.host}":
-            raise web.HTTPForbidden(text="Only the cockpit's own page may connect.")
-        may_drive = self._may_drive(request)
+        self.access.check_origin(request)
+        may_drive = self.access.may_drive(request)
         if len(self.viewers) >= MOST_VIEWERS:
             raise web.HTTPServiceUnavailable(text=f"There are {MOST_VIEWERS} viewers already.")
         # Without autoping, control frames come as messages and are counted
@@ -269,7 +148,7 @@ class Server:
                 telling.cancel()
             self.viewers.remove(viewer)
             if channel.close_code == WSCloseCode.ABNORMAL_CLOSURE:
-                self._remark(f"lost the viewer at {viewer.remote}")
+                self.access.remark(f"lost the viewer at {viewer.remote}")
             if self.driver is viewer:
                 self.driver = None
                 with self.drive.person.lock:
@@ -277,7 +156,7 @@ class Server:
         return channel
 
     def _sit_down(self, viewer: Viewer) -> None:
-        """Nobody gets the wheel of a takeover that another one has begun: first it brakes."""
+        """Take the wheel if it is free. A takeover in progress is never transferred: the vehicle brakes first."""
         if viewer.may_drive and self.driver is None and not self.drive.person.read().takeover:
             self.driver = viewer
             with self.drive.person.lock:
@@ -300,7 +179,7 @@ class Server:
                     raise BadMessage("not text")
                 await self._obey(viewer, parse(message.data))
             except BadMessage as error:
-                self._remark(f"dropped the viewer at {viewer.remote}: {error}")
+                self.access.remark(f"dropped the viewer at {viewer.remote}: {error}")
                 await viewer.socket.close(code=WSCloseCode.POLICY_VIOLATION, message=str(error).encode())
                 return
 
@@ -316,7 +195,7 @@ class Server:
     # What they are told
 
     async def _publish(self) -> None:
-        """Wakes the viewers when there is something new, and every ``TELL`` anyway."""
+        """Wake the viewers when there is something new, and every ``TELL`` anyway."""
         told = time.monotonic()
         while True:
             with suppress(asyncio.TimeoutError):
@@ -332,7 +211,7 @@ class Server:
                     viewer.news.set()
 
     async def _tell(self, viewer: Viewer) -> None:
-        """Sends the newest state and picture, as fast as the viewer takes them: who is slow gets fewer."""
+        """Send the newest state and picture, as fast as the viewer takes them: who is slow gets fewer."""
         with suppress(ConnectionError):
             while not viewer.socket.closed:
                 await viewer.news.wait()
@@ -364,9 +243,9 @@ class Server:
             "paused": drive.paused,
             "driver": driver,
             "takeover": driver == "person",
-            "collisions": display.collisions,
+            "collisions": drive.totals.collisions,
             "wants": now.takeover,
-            "indicators": indicators(display, drive.lag, now.connected, role != "driver"),
+            "indicators": indicators(display, drive.totals, drive.lag, now.connected, role != "driver"),
             "confidence": display.novice.confidence,
             "risk": display.novice.risk,
             "asks": asks_for_help(display, driver),
@@ -374,25 +253,6 @@ class Server:
             "applied": display.applied,
             "input": (now.steering, now.pedals),
         }
-
-    async def _sweep(self, http: web.Server) -> None:
-        """Closes connections that ask for nothing, so that they do not keep others out."""
-        seen: dict[Any, float] = {}
-        while True:
-            await asyncio.sleep(PATIENCE / 4)
-            now, connections = time.monotonic(), set(http.connections)
-            self._useful &= connections
-            seen = {connection: seen.get(connection, now) for connection in connections - self._useful}
-            for connection, since in seen.items():
-                if now - since > PATIENCE:
-                    connection.force_close()
-
-
-class _Refusal(asyncio.Protocol):
-    """A connection too many."""
-
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        transport.close()
 
 
 def as_jpeg(picture: np.ndarray) -> bytes:
@@ -443,7 +303,7 @@ async def serve(
     tls: ssl.SSLContext | None = None,
 ) -> None:
     """
-    Serves the cockpit until the drive is over. SIGINT and SIGTERM end it as the person's quit does.
+    Serve the cockpit until the drive is over. SIGINT and SIGTERM end it as the person's quit does.
 
     :param drive: with ``device`` at its wheel
     :param device: of the driver
@@ -454,21 +314,22 @@ async def serve(
     :raises OSError: if the address cannot be had
     """
     server = Server(drive, device, address, tls)
+    access = server.access
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, drive.quit)
     async with server.listening():
-        if not server.address.is_loopback and tls is None:
+        if not access.address.is_loopback and tls is None:
             print(
                 f"Warning: {address.host} can be reached from other machines, and nothing is encrypted. Safer: --tls-cert, or "
-                f"--serve 127.0.0.1:{server.address.port}, and on your machine ssh -L {server.address.port}:127.0.0.1:"
-                f"{server.address.port} HERE.",
+                f"--serve 127.0.0.1:{access.address.port}, and on your machine ssh -L {access.address.port}:127.0.0.1:"
+                f"{access.address.port} HERE.",
                 file=sys.stderr,
             )
-        print(f"Drive at  {server.url(server.driver_token)}")
-        print(f"Watch at  {server.url(server.spectator_token)}", flush=True)
-        if not server.address.is_loopback and sys.stdout.isatty():
-            print("Drive with a phone in this network:\n" + qr_code(server.url(server.driver_token)), flush=True)
+        print(f"Drive at  {access.url(access.driver_token)}")
+        print(f"Watch at  {access.url(access.spectator_token)}", flush=True)
+        if not access.address.is_loopback and sys.stdout.isatty():
+            print("Drive with a phone in this network:\n" + qr_code(access.url(access.driver_token)), flush=True)
         begin()
         while not is_over():
             await asyncio.sleep(0.1)

@@ -1,4 +1,4 @@
-"""What the threads of a drive share: the clock of the steps, pause and quit, and what there is to be seen."""
+"""Session state shared by the UI, driving and learner threads: clock, pause, quit, what is displayed, and totals."""
 
 import threading
 import time
@@ -20,7 +20,7 @@ class SessionEnded(Exception):
 @dataclass(frozen=True)
 class Novice:
     """
-    What the learning driver says of itself.
+    State of the novice, as it tells it.
 
     :param stage: of the training, to read
     :param self_drives: C-HAC in stage 2: whether the self-learning policy acts
@@ -39,7 +39,7 @@ class Novice:
 @dataclass(frozen=True)
 class Display:
     """
-    What the cockpit shows of the last step.
+    Picture and numbers of the last step.
 
     :param picture: of the environment, shape (height, width, 3), uint8
     :param number: of the picture
@@ -49,12 +49,7 @@ class Display:
     :param brakes: whether the vehicle was braked because nobody is at the wheel
     :param proposed: by the novice: steering (-1 left to 1 right) and pedals (-1 brake to 1 throttle)
     :param applied: what was executed
-    :param total_steps: of the training
-    :param human_steps: of them driven by the person
-    :param seconds: [s] driven, without pauses
-    :param episode: number of the episode in this drive
-    :param cost: safety cost of this drive
-    :param collisions: of this drive
+    :param novice: what the learning driver says of itself
     """
 
     picture: np.ndarray | None = None
@@ -65,16 +60,32 @@ class Display:
     brakes: bool = False
     proposed: tuple[float, float] = (0.0, 0.0)
     applied: tuple[float, float] = (0.0, 0.0)
+    novice: Novice = Novice()
+
+
+@dataclass(frozen=True)
+class Totals:
+    """
+    Sums over a drive, or over the whole training: those are the model's counts.
+
+    :param total_steps: of the training
+    :param human_steps: of them driven by the person
+    :param seconds: [s] driven in the training, without pauses
+    :param episode: number of the episode in this drive
+    :param cost: safety cost of this drive
+    :param collisions: of this drive
+    """
+
     total_steps: int = 0
     human_steps: int = 0
     seconds: float = 0.0
     episode: int = 0
     cost: float = 0.0
     collisions: int = 0
-    novice: Novice = Novice()
 
     @property
     def takeover_rate(self) -> float:
+        """Share of the steps that the person drove."""
         return self.human_steps / self.total_steps if self.total_steps else 0.0
 
 
@@ -91,8 +102,8 @@ class Session:
         self.person = person
         self.query = query
         self.period = 1 / rate
-        self.display = Display()  # replaced as a whole
-        self.novice = Novice()
+        self.display = Display()  # replaced as a whole, as are the totals
+        self.totals = Totals()
         self.lag = 0  # gradient steps that the learner owes
         self.busy = ""  # why the car waits though nobody paused
         self.message = TO_BEGIN
@@ -115,7 +126,7 @@ class Session:
             self._changed.notify_all()
 
     def go_on(self) -> None:
-        """Ends a pause, unless there is nothing to take over with."""
+        """End a pause, unless there is nothing to take over with."""
         if not self.person.read().connected:
             self.pause(lost_message(self.person.device.name))
             return
@@ -124,17 +135,17 @@ class Session:
             self._changed.notify_all()
 
     def toggle_pause(self) -> None:
-        """Pauses, or goes on."""
+        """Pause, or go on."""
         self.go_on() if self.paused else self.pause()
 
     def skip(self) -> None:
-        """The next step is the last of the episode. If it is paused, the next episode waits."""
+        """Make the next step the last of the episode. If it is paused, the next episode waits."""
         with self._changed:
             self._skip = True
             self._changed.notify_all()
 
     def quit(self) -> None:
-        """Ends the drive before its next step."""
+        """End the drive before its next step."""
         with self._changed:
             self.ended = True
             self._changed.notify_all()
@@ -155,14 +166,14 @@ class Session:
 
     @property
     def notice(self) -> str:
-        """What the person is to be told, "" for nothing."""
+        """Message to the person, "" for none."""
         return "Saving: please wait" if self.ended else self.busy or self.message
 
     # For the driving thread
 
     def wait_for_tick(self) -> None:
         """
-        Returns when the next step is due, ``period`` after the last one at the earliest; in a pause, when it is over.
+        Wait until the next step is due, ``period`` after the last one at the earliest; in a pause, when it is over.
 
         :raises SessionEnded: if the person has quit
         """
@@ -199,6 +210,14 @@ class Session:
         """
         self.display = replace(self.display, **changes)
 
+    def count(self, **totals: Any) -> None:
+        """
+        Change the totals.
+
+        :param totals: new values of ``totals``
+        """
+        self.totals = replace(self.totals, **totals)
+
     # For those who work beside it
 
     def time_to_tick(self) -> float:
@@ -211,7 +230,7 @@ class Session:
 
     def wait_for_room(self, seconds: float) -> None:
         """
-        Keeps the moment of the next step free: returns when there are ``seconds`` before it, or the step is under way.
+        Keep the moment of the next step free: wait until there are ``seconds`` before it, or the step is under way.
 
         :param seconds: [s] that are needed; with more than most of a period there is no point in waiting
         """
@@ -262,10 +281,13 @@ TAKEOVER = {"person": "YOU DRIVE", "brake": "nobody", "novice": "no"}
 FOR_OTHERS = "a person"  # what those see who only watch
 
 
-def indicators(display: Display, lag: int, is_manned: bool = True, watches: bool = False) -> list[tuple[str, str]]:
+def indicators(
+    display: Display, totals: Totals, lag: int, is_manned: bool = True, watches: bool = False
+) -> list[tuple[str, str]]:
     """
     Collect the indicators of the paper's display.
 
+    :param totals: of the drive
     :param lag: gradient steps that the learner owes
     :param is_manned: whether somebody is at the wheel now
     :param watches: whether it is shown to somebody who is not at the wheel
@@ -274,20 +296,20 @@ def indicators(display: Display, lag: int, is_manned: bool = True, watches: bool
     novice, driver = display.novice, who_drives(display, is_manned)
     risk = "-" if novice.risk is None else f"{novice.risk:.0%}"
     acts = "in use" if novice.self_drives and driver == "novice" else "no"
-    minutes, seconds = divmod(int(display.seconds), 60)
+    minutes, seconds = divmod(int(totals.seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return [
         ("speed", "-" if display.speed is None else f"{3.6 * display.speed:.0f} km/h"),
         ("takeover", FOR_OTHERS if driver == "person" and watches else TAKEOVER[driver]),
         ("route", "-" if display.route is None else f"{display.route:.0%}"),
-        ("total step", f"{display.total_steps}"),
+        ("total step", f"{totals.total_steps}"),
         ("total time", f"{hours}:{minutes:02}:{seconds:02}"),
-        ("takeover rate", f"{display.takeover_rate:.1%}"),
+        ("takeover rate", f"{totals.takeover_rate:.1%}"),
         ("stage", novice.stage or "-"),
         ("self-learning", "-" if novice.self_drives is None else acts),
         ("confidence", "-" if novice.confidence is None else f"{novice.confidence:.2f}"),
         ("risk", f"HELP {risk}" if asks_for_help(display, driver) else risk),
-        ("cost", f"{display.cost:g}"),
-        ("episode", f"{display.episode}"),
+        ("cost", f"{totals.cost:g}"),
+        ("episode", f"{totals.episode}"),
         ("updates behind", f"{lag}" if lag else "none"),
     ]

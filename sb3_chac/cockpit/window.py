@@ -46,7 +46,7 @@ HELP = (
 
 class Window:
     """
-    Opens a window. Events are handed on as they come, whatever is being drawn otherwise waits.
+    Window of the cockpit. Events are handed on as they come, whatever is being drawn otherwise waits.
 
     :param title: of the window
     :raises RuntimeError: if no window can be opened
@@ -94,6 +94,7 @@ class Window:
                 self.handle(event)
 
     def close(self) -> None:
+        """Close the window."""
         pygame.display.quit()
 
     def handle(self, event: Any) -> None:
@@ -120,12 +121,12 @@ class Window:
     # What is drawn
 
     def draw(self) -> None:
-        """One frame."""
+        """Draw one frame."""
         drive, display = self.drive, self.drive.display
         self.screen.fill(PANEL)
         if display.picture is not None:
             self._draw_picture(display.picture)
-        self._draw_side(display, drive.lag)
+        self._draw_side(display)
         self._draw_strip(display)
         if drive.notice:
             self._draw_message(drive.notice, ORANGE if drive.paused or drive.busy or drive.ended else RED)
@@ -151,13 +152,13 @@ class Window:
         surface = self._picture[1]
         self.screen.blit(surface, surface.get_rect(center=PICTURE.center))
 
-    def _draw_side(self, display: Display, lag: int) -> None:
-        is_manned = self.drive.person.read().connected
+    def _draw_side(self, display: Display) -> None:
+        is_manned, lag = self.drive.person.read().connected, self.drive.lag
         driver = who_drives(display, is_manned)
         colour_of_driver = COLOURS[driver]
         pygame.draw.rect(self.screen, colour_of_driver, (SIDE.left, 0, 6, SIDE.height))
         y = 24
-        for name, value in indicators(display, lag, is_manned):
+        for name, value in indicators(display, self.drive.totals, lag, is_manned):
             colour = TEXT
             if name == "takeover" and colour_of_driver != EGO:
                 colour = colour_of_driver

@@ -50,7 +50,8 @@ class Cockpit(gym.Wrapper):
         self.recorder.begin(observation, seed, options)
         self.steps = 0
         self._touched = False
-        self._show(info, takeover=False, episode=self.drive.display.episode + 1)
+        self.drive.count(episode=self.drive.totals.episode + 1)
+        self._show(info, takeover=False)
         return observation, info
 
     def step(self, action: np.ndarray) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
@@ -67,17 +68,15 @@ class Cockpit(gym.Wrapper):
         truncated = truncated or (drive.take_skip() and not terminated)
         self.steps += 1
         self.recorder.add(proposed, observation, float(reward), terminated, truncated, info)
+        drive.count(
+            cost=drive.totals.cost + info.get("cost", 0.0),
+            collisions=drive.totals.collisions + self._has_collided(info),
+        )
         self._show(
             info,
             takeover=info["takeover"],
             proposed=person.as_input(proposed),
             applied=person.as_input(info["applied_action"]),
-            total_steps=drive.display.total_steps + 1,
-            human_steps=drive.display.human_steps + bool(info["takeover"]),
-            seconds=drive.display.seconds + drive.period,
-            cost=drive.display.cost + info.get("cost", 0.0),
-            collisions=drive.display.collisions + self._has_collided(info),
-            novice=drive.novice,
         )
         return observation, reward, terminated, truncated, info
 
@@ -105,7 +104,7 @@ class Cockpit(gym.Wrapper):
 
     def _has_collided(self, info: dict[str, Any]) -> bool:
         """
-        Whether a collision has begun; environments report one by ``collision``, or by ``crashed`` for as long as it lasts.
+        Tell whether a collision has begun. Environments report one by ``collision``, or by ``crashed`` while it lasts.
 
         :param info: of a step
         :return: whether one has begun in it

@@ -121,7 +121,7 @@ class TransitionStore:
 
 class DualReplayBuffer(ReplayBuffer):
     """
-    Steps that the human drove go to the store ``human`` (B_h), all others to ``novice`` (B_g). Batches take a share from each.
+    Buffer with two stores: ``human`` (B_h) for what the human drove, ``novice`` (B_g) for the rest. Batches take from both.
 
     Each row holds its next observation, as the following row belongs to another time when two stores are fed in turns. Rows of
     several environments stand in one ring. With ``n_steps`` above 1 the return of a row ends early where the human takes over
@@ -265,7 +265,7 @@ class DualReplayBuffer(ReplayBuffer):
         (self.human if row["takeover"] else self.novice).append(row)
 
     def _append_return(self, pending: deque[dict[str, Any]]) -> None:
-        """Completes the oldest transition: rewards up to the last one, then its next observation."""
+        """Complete the oldest transition: rewards up to the last one, then its next observation."""
         ends = {name: value for name, value in pending[-1].items() if name == "done" or name.startswith("next_observation/")}
         sums = {
             name: sum(self.gamma**k * row[name] for k, row in enumerate(pending))
@@ -278,7 +278,7 @@ class DualReplayBuffer(ReplayBuffer):
             self._append_return(pending)
 
     def end_trajectories(self) -> None:
-        """Completes all returns with what is there, for when the environments are about to be reset."""
+        """Complete all returns with what is there, for when the environments are about to be reset."""
         for pending in self.pending.values():
             self._flush(pending)
 

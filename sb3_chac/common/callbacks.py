@@ -1,4 +1,4 @@
-"""What is shown and written while one of our algorithms learns."""
+"""Callbacks that show and write how one of our algorithms learns."""
 
 from pathlib import Path
 from typing import Any
@@ -72,7 +72,7 @@ class GuidedProgressBar(ProgressBarCallback):
 
 class SafetyCost(BaseCallback):
     """
-    Sums up the safety cost (``info["cost"]``, if there is any) of a training whose algorithm does not, as
+    Sum of the safety cost (``info["cost"]``, if there is any) of a training whose algorithm does not, as
     ``safety/safety_cost`` of the logger and ``model.safety_cost``, which is saved with the model.
     """
 
@@ -92,7 +92,7 @@ class SafetyCost(BaseCallback):
 
 class CSVProgress(BaseCallback):
     """
-    Also writes what the logger gets as CSV, a row each time it is dumped. It adds rows when the training starts and ends and
+    Writer of what the logger gets as CSV, a row each time it is dumped. It adds rows when the training starts and ends and
     when a stage begins: they tell the runs of a training apart, and its stages, to the step.
 
     :param file: is overwritten

@@ -39,6 +39,21 @@ def check_action_space(action_space: spaces.Space) -> None:
         )
 
 
+def check_policy(algorithm: type, policy: type, required: type) -> None:
+    """
+    Check the class of a policy.
+
+    :param algorithm: that is to have it
+    :param required: class that it must derive from
+    :raises ValueError: unless it does
+    """
+    if not issubclass(policy, required):
+        raise ValueError(
+            f"policy: {algorithm.__name__} needs a {required.__name__}, got {policy.__name__} (of {policy.__module__}). If it "
+            "came from a checkpoint, load that with the class that saved it."
+        )
+
+
 def check_driving_action(action: Any) -> None:
     """
     Check the action of a driving task.

@@ -29,7 +29,7 @@ TOLERANCE = 1e-4  # of actions scaled to [-1, 1], for rounding
 
 class Report(NamedTuple):
     """
-    What ``info`` says of one step.
+    Report of ``info`` on one step.
 
     :param takeover: whether the human acted
     :param action: what was executed, if the human acted, in the units of the environment that reports it
@@ -43,7 +43,7 @@ class Report(NamedTuple):
 
 def read_report(info: dict[str, Any], action_space: spaces.Space, env_idx: int = 0) -> Report:
     """
-    The flag decides; only where there is none does the presence of an action. None is as good as not there.
+    Read who acted. The flag decides; only where there is none does the presence of an action. None is as good as not there.
 
     :param info: of one step
     :param action_space: of the actions
@@ -100,6 +100,18 @@ def _truth(key: str, value: Any, env_idx: int) -> bool:
     return bool(np.any(array))
 
 
+def scale_action(action: np.ndarray, action_space: spaces.Box) -> np.ndarray:
+    """
+    Scale an action.
+
+    :param action: in the units of the environment
+    :param action_space: a Box with finite bounds
+    :return: ``action`` with the bounds mapped to -1 and 1, in float64
+    """
+    low, high = action_space.low.astype(np.float64), action_space.high.astype(np.float64)
+    return 2 * (np.asarray(action, dtype=np.float64) - low) / (high - low) - 1
+
+
 def scaled(action: np.ndarray, action_space: spaces.Space, env_idx: int) -> np.ndarray:
     """
     Scale the human's action.
@@ -109,8 +121,7 @@ def scaled(action: np.ndarray, action_space: spaces.Space, env_idx: int) -> np.n
     :raises ValueError: if it is outside of the bounds
     """
     assert isinstance(action_space, spaces.Box)
-    low, high = action_space.low.astype(np.float64), action_space.high.astype(np.float64)
-    values = 2 * (action - low) / (high - low) - 1
+    values = scale_action(action, action_space)
     if np.any(np.abs(values) > 1 + TOLERANCE):
         raise ValueError(
             f"The human's action of environment {env_idx} is out of bounds, {action} is not in {action_space}: clip it, or "
@@ -190,7 +201,7 @@ class _ActionWrapperAboveTakeover(type):
 
 
 class ActionWrapperAboveTakeover(metaclass=_ActionWrapperAboveTakeover):
-    """What is an instance of this class changes actions on their way to a ``TakeoverWrapper`` below."""
+    """Class of all wrappers that change actions on their way to a ``TakeoverWrapper`` below."""
 
 
 def action_wrapper_above_report(env: gym.Env) -> gym.Wrapper | None:

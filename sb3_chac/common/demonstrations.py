@@ -1,10 +1,8 @@
 """Demonstrations: datasets in Minari's format (minari.farama.org) as flat arrays. ``datasets.recording`` makes some."""
 
-import json
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias, Union
 
 import numpy as np
@@ -12,8 +10,9 @@ from gymnasium import spaces
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.vec_env import VecTransposeImage
 
-from sb3_chac.common.checks import is_finite
+from sb3_chac.common.checks import check_action_space, is_finite
 from sb3_chac.common.contract import NOVICE_ACTION, TAKEOVER
+from sb3_chac.common.minari_datasets import HOW_TO_GET_ONE, DatasetError, damaged, is_minari_dataset, open_dataset
 
 if TYPE_CHECKING:
     from minari import MinariDataset
@@ -26,16 +25,8 @@ Dataset: TypeAlias = Union[
     "MinariDataset",
     Sequence[Union[str, os.PathLike[str], "Demonstrations", "MinariDataset"]],
 ]
-HOW_TO_GET_ONE = (
-    "Record one with 'python -m sb3_chac demos record', fetch one with 'minari download', or list those that are there with "
-    "'minari list local'."
-)
 # Names in the infos of a recording -> fields of Demonstrations. An action's info is stored at the index of what follows it
 INFOS = {TAKEOVER: "takeovers", NOVICE_ACTION: "novice_actions", "cost": "costs", "is_success": "successes"}
-
-
-class DatasetError(ValueError):
-    """Raised for a dataset that is missing, damaged, empty or made for other spaces; says what is wrong and what to do."""
 
 
 def missing_dataset(algorithm: str) -> DatasetError:
@@ -54,8 +45,7 @@ def missing_dataset(algorithm: str) -> DatasetError:
 @dataclass(frozen=True, eq=False)
 class Demonstrations:
     """
-    What somebody did in an environment, step after step: n steps of all episodes, in their order. The dtypes are those of the
-    recording.
+    Flat arrays of demonstrated transitions: n steps of all episodes, in their order. The dtypes are those of the recording.
 
     :param observation_space: of the observations, a Box
     :param action_space: of the actions, a Box or Discrete
@@ -91,7 +81,7 @@ class Demonstrations:
 
     @property
     def ends(self) -> np.ndarray:
-        """Whether a step is the last one of its episode, whatever its flags say, shape (n,)."""
+        """Ends of episodes: whether a step is the last one of its episode, whatever its flags say, shape (n,)."""
         return self.terminations | self.truncations | (np.diff(self.episodes, append=self.episodes[-1:] + 1) != 0)
 
 
@@ -124,7 +114,7 @@ def load_demonstrations(
         try:
             demonstrations = _read(opened)
         except Exception as error:  # h5py raises nearly anything, numpy for shapes that do not fit together
-            raise _damaged(name, error) from error
+            raise damaged(name, error) from error
     else:
         raise DatasetError(
             f"dataset: must be the id or folder of a dataset, a MinariDataset, Demonstrations or a list, got {dataset!r}."
@@ -178,111 +168,6 @@ def joined(parts: Sequence[Demonstrations]) -> Demonstrations:
     return replace(first, episodes=np.concatenate(episodes), **columns)
 
 
-def is_minari_dataset(dataset: Any) -> bool:
-    """
-    Tell Minari's datasets from others, without importing Minari.
-
-    :return: whether it is a ``MinariDataset``
-    """
-    from minari import MinariDataset
-
-    return isinstance(dataset, MinariDataset)
-
-
-def open_dataset(dataset: "str | os.PathLike[str] | MinariDataset") -> "MinariDataset":
-    """
-    Open a dataset with Minari.
-
-    :param dataset: id of a local dataset of Minari, its folder, or what was opened before
-    :raises DatasetError: if it is missing, damaged, empty, or made by a version of Minari that the installed one cannot read
-    """
-    from minari import MinariDataset
-
-    if isinstance(dataset, MinariDataset):
-        opened, name = dataset, f"dataset {dataset.id!r}"
-    else:
-        folder, name = find_dataset(dataset), f"dataset {os.fspath(dataset)!r}"
-        check_version(folder, name)
-        try:
-            opened = MinariDataset(folder)
-        except Exception as error:  # whatever a damaged file leads to
-            raise _damaged(name, error) from error
-    try:
-        empty = len(opened.episode_indices) == 0 or opened.total_steps == 0
-    except Exception as error:
-        raise _damaged(name, error) from error
-    if empty:
-        raise DatasetError(f"{name} holds no steps. {HOW_TO_GET_ONE}")
-    return opened
-
-
-def check_version(folder: Path, name: str) -> None:
-    """
-    Check that Minari can read a dataset.
-
-    :param folder: that holds the data
-    :param name: of the dataset, for the message
-    :raises DatasetError: if the installed Minari cannot read what another version has written
-    """
-    from minari import __version__, supported_dataset_versions
-
-    try:
-        version = json.loads((folder / "metadata.json").read_text())["minari_version"]
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
-        return  # not Minari's, which it says itself
-    if version not in supported_dataset_versions:
-        raise DatasetError(
-            f"{name} was made by Minari {version}, which the installed Minari {__version__} cannot read (only "
-            f"{', '.join(sorted(supported_dataset_versions))}). Install a version that can (pip install minari=={version}), "
-            "or record or download the dataset anew."
-        )
-
-
-def find_dataset(dataset: str | os.PathLike[str]) -> Path:
-    """
-    Find the folder of a dataset.
-
-    :param dataset: id of a local dataset of Minari, or its folder
-    :return: the folder that holds the data
-    :raises DatasetError: if there is none
-    """
-    name = os.fspath(dataset)
-    candidates = [Path(name)]
-    if is_dataset_id(name):
-        candidates.insert(0, minari_folder() / name)
-    for candidate in candidates:
-        if (candidate / "data").is_dir():
-            return candidate / "data"
-        if (candidate / "metadata.json").is_file():
-            return candidate
-    looked_for = " or ".join(str(candidate) for candidate in candidates)
-    raise DatasetError(f"There is no dataset {name!r} (looked for {looked_for}). {HOW_TO_GET_ONE}")
-
-
-def minari_folder() -> Path:
-    """
-    Return Minari's folder of datasets, which need not exist yet.
-
-    :return: where Minari keeps its datasets. It need not exist yet
-    """
-    return Path(os.environ.get("MINARI_DATASETS_PATH") or Path.home() / ".minari" / "datasets")
-
-
-def is_dataset_id(name: str) -> bool:
-    """
-    Tell whether a name is an id of Minari.
-
-    :return: whether it is an id such as "safedrive/scripted-v0", with a version at its end
-    """
-    from minari.dataset.minari_dataset import parse_dataset_id
-
-    try:
-        parse_dataset_id(name)
-    except (ValueError, TypeError):  # malformed, without a version
-        return False
-    return True
-
-
 def check_spaces(observation_space: spaces.Space, action_space: spaces.Space) -> None:
     """
     Check that a dataset can hold the spaces.
@@ -296,6 +181,19 @@ def check_spaces(observation_space: spaces.Space, action_space: spaces.Space) ->
         )
     if not isinstance(action_space, spaces.Box | spaces.Discrete):
         raise DatasetError(f"Demonstrations need Box or Discrete actions, got {action_space}. Wrap the environment.")
+
+
+def check_imitable(env: Any) -> None:
+    """
+    Check that an algorithm can imitate in an environment: a dataset can hold its spaces, and a Box of actions is bounded.
+
+    :param env: a gymnasium or vectorized environment
+    :raises DatasetError: for other spaces
+    :raises UnsupportedActionSpace: for actions without finite bounds
+    """
+    check_spaces(env.observation_space, env.action_space)
+    if isinstance(env.action_space, spaces.Box):
+        check_action_space(env.action_space)
 
 
 def space_difference(found: spaces.Space, expected: spaces.Space) -> str:
@@ -390,10 +288,10 @@ def _check_arrays(demonstrations: Demonstrations, name: str) -> None:
         if values is None:
             continue
         if values.shape != shape:
-            raise _damaged(name, f"{field} have shape {values.shape} instead of {shape}")
+            raise damaged(name, f"{field} have shape {values.shape} instead of {shape}")
         if not is_finite(values):
             step = next(step for step in range(steps) if not is_finite(values[step]))
-            raise _damaged(name, f"{field} are NaN or infinite at step {step}")
+            raise damaged(name, f"{field} are NaN or infinite at step {step}")
     if isinstance(action_space, spaces.Discrete):
         low, high = np.array(action_space.start), np.array(action_space.start + action_space.n - 1)
     else:
@@ -413,18 +311,11 @@ def _check_arrays(demonstrations: Demonstrations, name: str) -> None:
 
 
 def _channels_first(demonstrations: Demonstrations) -> Demonstrations:
-    """As SB3's models see images: it transposes those of environments itself."""
+    """Transpose images as SB3's models see them."""
     assert isinstance(demonstrations.observation_space, spaces.Box)
     return replace(
         demonstrations,
         observation_space=VecTransposeImage.transpose_space(demonstrations.observation_space),
         observations=np.moveaxis(demonstrations.observations, -1, 1),
         next_observations=np.moveaxis(demonstrations.next_observations, -1, 1),
-    )
-
-
-def _damaged(name: str, problem: object) -> DatasetError:
-    return DatasetError(
-        f"{name}: the dataset cannot be used, it is damaged or not Minari's: {str(problem) or type(problem).__name__}. "
-        "Restore it from a copy, or record it anew with 'python -m sb3_chac demos record --overwrite'."
     )

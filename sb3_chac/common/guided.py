@@ -1,7 +1,5 @@
-"""What the algorithms that learn from takeovers share: asking the human, storing who drove, counting."""
+"""Base class for algorithms that learn from takeovers: asking the human, storing who drove, counting."""
 
-import io
-import pathlib
 import warnings
 from collections import deque
 from typing import Any, TypeVar
@@ -50,6 +48,7 @@ class GuidedOffPolicyAlgorithm(CheckedOffPolicyAlgorithm):
     proposed. Environments that do the takeovers themselves may report them in ``info``, see ``contract.read_report``.
     """
 
+    required_buffer = DualReplayBuffer
     replay_buffer: DualReplayBuffer
 
     def _setup_model(self) -> None:
@@ -78,7 +77,7 @@ class GuidedOffPolicyAlgorithm(CheckedOffPolicyAlgorithm):
 
     def store_demonstrations(self, dataset: Dataset) -> None:
         """
-        Puts a dataset into the replay buffer, as if it had been driven: what the human drove (all of it, if the dataset does
+        Put a dataset into the replay buffer, as if it had been driven: what the human drove (all of it, if the dataset does
         not say who drove) beside what the novice proposed, and the rest. It is not counted as steps of this training.
 
         :param dataset: see ``load_demonstrations``
@@ -127,7 +126,7 @@ class GuidedOffPolicyAlgorithm(CheckedOffPolicyAlgorithm):
         return self.counts["safety_cost"] if "safety_cost" in self.measured else None
 
     def _needs_human(self) -> bool:
-        """Whether the human is asked in this stage of the training."""
+        """Tell whether the human is asked in this stage of the training."""
         return True
 
     def _setup_learn(
@@ -177,7 +176,7 @@ class GuidedOffPolicyAlgorithm(CheckedOffPolicyAlgorithm):
         return self
 
     def _prepare_wrappers(self) -> None:
-        """Wrappers that are new go on with the counts of those before them."""
+        """Let wrappers that are new go on with the counts of those before them."""
         if not self._wrapped:
             return
         if self.wrapper_states and len(self.wrapper_states) != self.n_envs:  # deal out the sums
@@ -214,8 +213,8 @@ class GuidedOffPolicyAlgorithm(CheckedOffPolicyAlgorithm):
 
     def _begin_step(self) -> None:
         """
-        The next step of the environments is one of the training. If somebody else has been in them since the last one (an
-        evaluation in the training environment), new episodes begin.
+        Announce that the next step of the environments is one of the training. If somebody else has been in them since the
+        last one (an evaluation in the training environment), new episodes begin.
         """
         expected, self._expected = self._expected, [(-1, -1)] * len(self._wrapped)  # until the step is made
         if self._announce_step() != expected and expected is not None:
@@ -245,7 +244,7 @@ class GuidedOffPolicyAlgorithm(CheckedOffPolicyAlgorithm):
         return sorted(self._wrapped, key=lambda idx: not self.human_driving[idx])[:left]
 
     def _start_over(self) -> None:
-        """Begins new episodes in all environments."""
+        """Begin new episodes in all environments."""
         assert self.env is not None
         self.replay_buffer.end_trajectories()
         self._forget_episodes()
@@ -258,18 +257,6 @@ class GuidedOffPolicyAlgorithm(CheckedOffPolicyAlgorithm):
         super()._update_info_buffer(infos, dones)
         assert dones is not None
         self._expected = [(0, int(dones[idx])) for idx in self._wrapped]  # a VecEnv resets what is over
-
-    def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
-        """
-        As in SB3.
-
-        :raises ValueError: if it is not a ``DualReplayBuffer``; then nothing is changed
-        """
-        before = self.replay_buffer
-        super().load_replay_buffer(path, truncate_last_traj)
-        if not isinstance(self.replay_buffer, DualReplayBuffer):
-            other, self.replay_buffer = self.replay_buffer, before
-            raise ValueError(f"load_replay_buffer: {path} holds no DualReplayBuffer, got {type(other).__name__}.")
 
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1

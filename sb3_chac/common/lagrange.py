@@ -142,9 +142,9 @@ def constrained_advantages(advantages: th.Tensor, cost_advantages: th.Tensor, mu
 
 class CostConstrainedAlgorithm(BaseAlgorithm):
     """
-    Counts what the environments report in ``info["cost"]``, as it is (``VecNormalize`` leaves it alone), and holds the
-    multiplier. To be derived from before an algorithm of SB3, which calls ``_set_constraint`` in its constructor and
-    ``_setup_constraint`` in ``_setup_model``.
+    Base of the algorithms under a constraint on the cost. It counts what the environments report in ``info["cost"]``, as it is
+    (``VecNormalize`` leaves it alone), and holds the multiplier. To be derived from before an algorithm of SB3, which calls
+    ``_set_constraint`` in its constructor and ``_setup_constraint`` in ``_setup_model``.
     """
 
     gamma: float

@@ -15,7 +15,7 @@ from torch import nn
 
 
 def mkl_is_held_back() -> bool:
-    """Whether the processor has AVX-512 and is not Intel's (Linux only: elsewhere we do not know, and say no)."""
+    """Tell whether the processor has AVX-512 and is not Intel's (Linux only: elsewhere we do not know, and say no)."""
     cpuinfo = Path("/proc/cpuinfo")
     if not th.backends.cpu.get_cpu_capability().startswith("AVX512") or not cpuinfo.is_file():
         return False
@@ -29,17 +29,17 @@ MIN_BATCH_SIZE = 32
 
 
 def is_traced() -> bool:
-    """Whether torch records what is computed (TorchScript, ONNX, ``torch.export``), to run it elsewhere."""
+    """Tell whether torch records what is computed (TorchScript, ONNX, ``torch.export``), to run it elsewhere."""
     return th.jit.is_tracing() or th.compiler.is_compiling()
 
 
 def uses_onednn() -> bool:
-    """Whether to take the detour."""
+    """Tell whether to take the detour."""
     return USE_ONEDNN and not is_traced()
 
 
 def takes_onednn(left: th.Tensor, right: th.Tensor) -> bool:
-    """Whether oneDNN computes the product of two matrices."""
+    """Tell whether oneDNN computes the product of two matrices."""
     is_float_matrix = left.dim() == 2 and left.dtype == right.dtype == th.float32
     return uses_onednn() and is_float_matrix and left.device.type == "cpu" and len(left) >= MIN_BATCH_SIZE
 

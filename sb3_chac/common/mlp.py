@@ -141,7 +141,7 @@ class FastMLP(nn.Sequential):
 
 
 def is_covered(module: nn.Module) -> bool:
-    """Whether a module is a plain ``nn.Sequential`` of linear layers, each with a known activation after it or none."""
+    """Tell whether a module is a plain ``nn.Sequential`` of linear layers, each with a known activation after it or none."""
     if type(module) is not nn.Sequential or len(module) == 0:
         return False
     after_linear = False

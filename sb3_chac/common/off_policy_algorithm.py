@@ -23,6 +23,7 @@ from sb3_chac.common.checks import (
     check_finite,
     check_integer,
     check_learning_rate,
+    check_policy,
     check_range,
     check_step,
 )
@@ -37,6 +38,8 @@ class CheckedOffPolicyAlgorithm(OffPolicyAlgorithm):
 
     # What ``policy`` must derive from
     required_policy: type[BasePolicy]
+    # What ``replay_buffer_class`` must derive from
+    required_buffer: ClassVar[type[ReplayBuffer]] = ReplayBuffer
     # That it has, see ``check_policy_kwargs``
     networks: ClassVar[tuple[str, ...]] = ("pi", "qf")
 
@@ -50,11 +53,7 @@ class CheckedOffPolicyAlgorithm(OffPolicyAlgorithm):
 
         :raises ValueError: names the argument and the remedy
         """
-        if not issubclass(self.policy_class, self.required_policy):
-            raise ValueError(
-                f"policy: {type(self).__name__} needs a {self.required_policy.__name__}, got {self.policy_class.__name__} "
-                f"(of {self.policy_class.__module__}). If it came from a checkpoint, load that with the class that saved it."
-            )
+        check_policy(type(self), self.policy_class, self.required_policy)
         check_policy_kwargs("policy_kwargs", self.policy_class, self.policy_kwargs, self.networks)
         check_learning_rate("learning_rate", self.learning_rate)
         check_integer("buffer_size", self.buffer_size, low=1)
@@ -112,6 +111,19 @@ class CheckedOffPolicyAlgorithm(OffPolicyAlgorithm):
         check_step(new_obs, reward, infos, self.num_timesteps)
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
 
+    def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
+        """
+        Load as SB3 does.
+
+        :raises ValueError: if it is no buffer of the kind that this algorithm needs; then nothing is changed
+        """
+        before = self.replay_buffer
+        super().load_replay_buffer(path, truncate_last_traj)
+        if not isinstance(self.replay_buffer, self.required_buffer):
+            other, self.replay_buffer = self.replay_buffer, before
+            name = self.required_buffer.__name__
+            raise ValueError(f"load_replay_buffer: {path} holds no {name}, got {type(other).__name__}.")
+
     def set_parameters(
         self,
         load_path_or_dict: str | pathlib.Path | io.BufferedIOBase | TensorDict,
@@ -119,7 +131,7 @@ class CheckedOffPolicyAlgorithm(OffPolicyAlgorithm):
         device: th.device | str = "auto",
     ) -> None:
         """
-        As in SB3, but parameters of another algorithm or network are refused before any is copied.
+        Set parameters as SB3 does, but parameters of another algorithm or network are refused before any is copied.
 
         :raises MismatchedParameters: names what differs
         """

@@ -1,4 +1,4 @@
-"""What the algorithms that learn from demonstrations alone (BC, CQL) share."""
+"""Base class for algorithms that learn from demonstrations alone (BC, CQL)."""
 
 import sys
 import time
@@ -15,8 +15,8 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_chac.common.arguments import check_policy_kwargs
-from sb3_chac.common.checks import check_action_space, check_integer, check_learning_rate, check_range
-from sb3_chac.common.demonstrations import Dataset, Demonstrations, check_spaces, load_demonstrations, missing_dataset
+from sb3_chac.common.checks import check_integer, check_learning_rate, check_policy, check_range
+from sb3_chac.common.demonstrations import Dataset, Demonstrations, check_imitable, load_demonstrations, missing_dataset
 from sb3_chac.common.utils import fix_statistics
 
 SelfOffline = TypeVar("SelfOffline", bound="OfflineAlgorithm")
@@ -38,7 +38,7 @@ class Batch(NamedTuple):
 
 class DatasetSampler:
     """
-    Deals out the steps of a dataset in shuffled passes. Whole episodes are kept apart for validation (neighbouring steps are
+    Sampler of transitions in shuffled epochs. Whole episodes are kept apart for validation (neighbouring steps are
     much alike); which, depends on the dataset only, so that a training that goes on does not learn from them. Of a single
     episode it is the end.
 
@@ -68,7 +68,7 @@ class DatasetSampler:
 
     @property
     def epochs(self) -> float:
-        """How often the training steps were gone through."""
+        """Number of epochs completed, with the fraction of the present one."""
         return self.drawn / len(self.training)
 
     def draw(self) -> np.ndarray:
@@ -160,11 +160,7 @@ class OfflineAlgorithm(BaseAlgorithm):
 
         :raises ValueError: names the argument and the remedy
         """
-        if not issubclass(self.policy_class, self.required_policy):
-            raise ValueError(
-                f"policy: {type(self).__name__} needs a {self.required_policy.__name__}, got {self.policy_class.__name__} "
-                f"(of {self.policy_class.__module__}). If it came from a checkpoint, load that with the class that saved it."
-            )
+        check_policy(type(self), self.policy_class, self.required_policy)
         check_policy_kwargs("policy_kwargs", self.policy_class, self.policy_kwargs, self.networks)
         check_learning_rate("learning_rate", self.learning_rate)
         check_integer("batch_size", self.batch_size, low=1)
@@ -172,9 +168,7 @@ class OfflineAlgorithm(BaseAlgorithm):
 
     @staticmethod
     def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
-        check_spaces(env.observation_space, env.action_space)
-        if isinstance(env.action_space, spaces.Box):
-            check_action_space(env.action_space)
+        check_imitable(env)
         return BaseAlgorithm._wrap_env(env, verbose, monitor_wrapper)
 
     def set_dataset(self, dataset: Dataset | None) -> None:

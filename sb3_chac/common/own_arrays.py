@@ -1,4 +1,4 @@
-"""What environments hand out in the training is kept as it was, also if they go on using their arrays."""
+"""Copies of what environments hand out in the training, which may go on using their arrays."""
 
 import copy
 from typing import Any

@@ -314,7 +314,7 @@ def conservative_gap(
     sampled_q_values: th.Tensor, log_densities: th.Tensor, data_q_values: th.Tensor, temperature: float = 1.0
 ) -> th.Tensor:
     """
-    How much larger Q is elsewhere than where the dataset is, ``T log integral of exp(Q(s, b) / T) db - Q(s, a)``, with the
+    Estimate how much larger Q is elsewhere than on the dataset, ``T log integral of exp(Q(s, b) / T) db - Q(s, a)``, with the
     integral estimated by importance sampling, ``1/M sum over i of exp(Q(s, b_i) / T) / mu_i(b_i)`` (Kumar et al. 2020,
     appendix F).
 

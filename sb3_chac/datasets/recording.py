@@ -32,7 +32,8 @@ from sb3_chac.common.contract import (
     read_report,
     scaled,
 )
-from sb3_chac.common.demonstrations import DatasetError, check_spaces
+from sb3_chac.common.demonstrations import check_spaces
+from sb3_chac.common.minari_datasets import DatasetError
 from sb3_chac.datasets.writer import DatasetWriter, folder_to_make
 from sb3_chac.evaluation.episodes import Runner, SavedModel, Task, make_env
 from sb3_chac.evaluation.evaluation import policy_name, saved_model, scenario_list
@@ -47,7 +48,7 @@ AHEAD = 2  # episodes that are queued, per process
 @dataclass(frozen=True)
 class WatchedEnv:
     """
-    Makes environments in which an expert watches who acts, and takes over: what ``record`` needs to record takeovers.
+    Environment factory with an armed ``InterventionWrapper``: what ``record`` needs to record takeovers.
 
     :param env: id of the environment
     :param expert: name of an expert of the environment, or a model
@@ -132,7 +133,7 @@ def record(
 
 class Recorder(Runner):
     """
-    Records the episodes of a task in this process. A context manager, which closes its environment.
+    Recorder of the episodes of a task in this process. A context manager, which closes its environment.
 
     :param task: what to record
     :param scenarios: take turns, None for those that the environment chooses

@@ -8,7 +8,7 @@ import numpy as np
 from gymnasium import spaces
 
 from sb3_chac.common.checks import is_finite
-from sb3_chac.common.demonstrations import DatasetError
+from sb3_chac.common.minari_datasets import DatasetError
 from sb3_chac.evaluation.episodes import Runner, Task, check_names_no_code, registered_spec
 
 if TYPE_CHECKING:
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 class Replay(Runner):
     """
-    Repeats the actions of an episode. A context manager, which closes its environment.
+    Replay of the actions of an episode. A context manager, which closes its environment.
 
     :param dataset: holds the episode
     :param number: of the episode

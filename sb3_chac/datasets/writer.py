@@ -11,7 +11,7 @@ import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec
 
 import sb3_chac
-from sb3_chac.common.demonstrations import DatasetError, is_dataset_id, minari_folder
+from sb3_chac.common.minari_datasets import DatasetError, is_dataset_id, minari_folder
 from sb3_chac.human.intervention import InterventionWrapper
 
 if TYPE_CHECKING:
@@ -24,7 +24,8 @@ LEFT_OUT = (InterventionWrapper.__name__, "Monitor")
 
 class DatasetWriter:
     """
-    Writes a dataset into a hidden folder beside its own and gives it its name at the end: what is interrupted leaves nothing.
+    Writer of a dataset. It fills a hidden folder beside its own, which gets its name at the end: what is interrupted leaves
+    nothing.
 
     :param folder: of the dataset, see ``folder_to_make``
     :param env: the environment that is recorded
@@ -58,6 +59,11 @@ class DatasetWriter:
         return self
 
     def add(self, episode: "EpisodeBuffer") -> None:
+        """
+        Add an episode.
+
+        :param episode: whole, with its infos
+        """
         self.storage.update_episodes([episode])
         self.steps += len(episode)
 

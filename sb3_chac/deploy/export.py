@@ -27,7 +27,7 @@ TOLERANCE = 1e-5  # of actions, as a share of half their range
 
 class Deployable(nn.Module):
     """
-    What ``model.predict(observation, deterministic=True)`` computes, as a function of tensors.
+    Function of tensors that computes what ``model.predict(observation, deterministic=True)`` does.
 
     :param policy: of the model
     :param keys: of a Dict observation, in the order of the arguments of ``forward``; empty for a single tensor
@@ -251,7 +251,7 @@ class Comparison:
 
     @property
     def equal(self) -> bool:
-        """Whether the differences are those of rounding."""
+        """Tell whether the differences are those of rounding."""
         return self.difference <= TOLERANCE and self.other_source == 0
 
     def __str__(self) -> str:

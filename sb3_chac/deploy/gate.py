@@ -11,7 +11,7 @@ from sb3_chac.deploy.metadata import Metadata, NotDeployable
 
 class State(IntEnum):
     """
-    Who determines what leaves the gate.
+    States of the gate, by who determines what leaves it.
 
     ======== =========================================================================================
     NOMINAL  the policy, with shared control if it has that
@@ -45,7 +45,7 @@ class Fault(IntFlag):
 
 class Given(NamedTuple):
     """
-    What the gate is given at one step. Times in seconds.
+    Input of the gate at one step. Times in seconds.
 
     :param action: what the policy wants, shape (action_dim,), None if there is nothing
     :param guided_action: what the human-guided policy alone wants, None if that is not known
@@ -75,7 +75,7 @@ class Given(NamedTuple):
 
 class Decision(NamedTuple):
     """
-    What leaves the gate.
+    Output of the gate at one step.
 
     :param action: finite and within the bounds, whatever the gate was given
     :param state: who determined it
@@ -92,8 +92,8 @@ class Decision(NamedTuple):
 @dataclass(frozen=True)
 class Limits:
     """
-    What the gate lets pass. The defaults are for a vehicle's side of a link at 10 Hz: BRAKE begins within .19 s of the last
-    packet, and throttle ends within .09 s.
+    Limits of what the gate lets pass. The defaults are for a vehicle's side of a link at 10 Hz: BRAKE begins within .19 s of
+    the last packet, and throttle ends within .09 s.
 
     :param low: least action, shape (action_dim,)
     :param high: greatest action
@@ -177,8 +177,8 @@ class Limits:
 
 class Gate:
     """
-    Checks what a policy wants and decides what the vehicle gets, once per step. It begins in BRAKE, until the first valid
-    step.
+    Gate that checks what a policy wants and decides what the vehicle gets, once per step. It begins in BRAKE, until the first
+    valid step.
 
     :param limits: see there
     """

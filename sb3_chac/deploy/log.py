@@ -18,7 +18,7 @@ from sb3_chac.deploy.udp import Observed
 
 class DecisionLog:
     """
-    Writes decisions in a thread of its own, so that a slow disk delays none. A context manager.
+    Log of decisions, written in a thread of its own, so that a slow disk delays none. A context manager.
 
     :param file: to write; it must not be there
     :param metadata: of the policy

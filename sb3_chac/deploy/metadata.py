@@ -50,7 +50,7 @@ class Input:
 @dataclass(frozen=True)
 class Metadata:
     """
-    What a runtime has to know of a policy.
+    Description of a policy for a runtime.
 
     :param inputs: the tensors that one observation consists of, in the order of the graph
     :param low: least action, in the units of the environment, shape (action_dim,)

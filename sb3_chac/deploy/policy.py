@@ -10,7 +10,7 @@ from sb3_chac.deploy.metadata import KEY, Metadata, NotDeployable
 
 class Proposal(NamedTuple):
     """
-    What a policy wants to do.
+    Proposal of a policy.
 
     :param action: in the units of the environment, shape (action_dim,)
     :param guided_action: what the human-guided policy alone would do; None unless the file holds shared control

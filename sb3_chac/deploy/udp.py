@@ -41,7 +41,7 @@ OFFSET_LEAK = 1e-4  # by which clocks may drift from each other, per second
 
 
 class Flag(IntFlag):
-    """What an observation packet tells besides the observation."""
+    """Flags of an observation packet."""
 
     NONE = 0
     OVERRIDE = 1  # a person drives
@@ -177,7 +177,7 @@ def _is_intact(data: bytes, magic: bytes, head: struct.Struct) -> bool:
 
 
 class Newest:
-    """Tells new packets from copies and old ones."""
+    """Filter that tells new packets from copies and old ones."""
 
     def __init__(self) -> None:
         self.session: int | None = None
@@ -185,7 +185,7 @@ class Newest:
         self._ended: list[int] = []
 
     def is_new(self, session: int, sequence: int) -> bool:
-        """Whether a packet is newer than all before it. A new session is a sender that was started again."""
+        """Tell whether a packet is newer than all before it. A new session is a sender that was started again."""
         if session in self._ended:
             return False
         if session != self.session:
@@ -200,8 +200,8 @@ class Newest:
 
 class RemoteClock:
     """
-    Tells how old a packet is, though the clocks of both ends have nothing to do with each other: against the packet that came
-    through fastest.
+    Clock that tells how old a packet is, though the clocks of both ends have nothing to do with each other: against the packet
+    that came through fastest.
     """
 
     def __init__(self) -> None:

@@ -37,6 +37,7 @@ class Method(NamedTuple):
 
     @property
     def label(self) -> str:
+        """Title with the number of seeds."""
         return f"{self.title} ({len(self.runs)} seed{'s' if len(self.runs) > 1 else ''})"
 
 
@@ -48,6 +49,11 @@ class Score(NamedTuple):
     high: float = math.nan
 
     def text(self, digits: int) -> str:
+        """
+        Word the score.
+
+        :param digits: after the point
+        """
         interval = "" if math.isnan(self.low) else f" [{self.low:.{digits}f}, {self.high:.{digits}f}]"
         return f"{self.value:.{digits}f}{interval}"
 
@@ -213,7 +219,7 @@ def interquartile_mean(values: np.ndarray) -> Score | None:
 
 def probability_of_improvement(better: np.ndarray, worse: np.ndarray) -> Score | None:
     """
-    How probably a run of one method ends above a run of another (Agarwal et al. 2021; ties count one half).
+    Estimate how probably a run of one method ends above a run of another (Agarwal et al. 2021; ties count one half).
 
     :param better: one value for each run, shape (n,)
     :param worse: likewise, of the other method

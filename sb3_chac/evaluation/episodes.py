@@ -39,7 +39,7 @@ class NotEvaluable(ValueError):
 
 class DrivenPath(NamedTuple):
     """
-    Where an episode went: ``positions`` [m] of shape (steps + 1, 2), ``costly`` of shape (steps + 1,): cost arose there, and
+    Path of an episode: ``positions`` [m] of shape (steps + 1, 2), ``costly`` of shape (steps + 1,): cost arose there, and
     ``actions`` of shape (steps, *action_shape), in the units of the environment.
     """
 
@@ -182,7 +182,7 @@ class ModelDriver(ModelExpert):
 
 
 class Task(NamedTuple):
-    """What a process has to know to run episodes, see ``evaluate``."""
+    """Task of a process that runs episodes, see ``evaluate``."""
 
     policy: BaseAlgorithm | SavedModel | str | Callable[[Any], Any]
     env: str | EnvSpec | Callable[..., gym.Env]
@@ -195,7 +195,7 @@ class Task(NamedTuple):
 
 class Runner:
     """
-    Runs the episodes of a task in this process. A context manager, which closes its environment.
+    Runner of the episodes of a task in this process. A context manager, which closes its environment.
 
     :param task: what to run
     :param render_mode: of the environment

@@ -14,8 +14,8 @@ from torch.nn import functional as F
 
 class Discriminator(nn.Module):
     """
-    Tells the expert's (observation, action) from the policy's: ``D(s, a) = sigmoid(logit)`` is the probability that they are
-    the expert's.
+    Network that tells the expert's (observation, action) from the policy's: ``D(s, a) = sigmoid(logit)`` is the probability
+    that they are the expert's.
 
     :param observation_space: Observation space, a Box
     :param action_space: Action space, a bounded Box or Discrete
@@ -61,7 +61,7 @@ class Discriminator(nn.Module):
 
     def normalize_by(self, observations: np.ndarray) -> None:
         """
-        From now on observations are scaled as it takes for these to have mean 0 and standard deviation 1, per entry.
+        Scale observations from now on so that these have mean 0 and standard deviation 1, per entry.
 
         :param observations: shape (n, *observation_shape), not images
         """

@@ -17,8 +17,8 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_chac.common.arguments import check_policy_kwargs, checked
 from sb3_chac.common.checked_rollouts import CheckedRollouts
-from sb3_chac.common.checks import check_action_space, check_integer, check_learning_rate, check_range
-from sb3_chac.common.demonstrations import Dataset, Demonstrations, check_spaces, load_demonstrations, missing_dataset
+from sb3_chac.common.checks import check_integer, check_learning_rate, check_range
+from sb3_chac.common.demonstrations import Dataset, Demonstrations, check_imitable, load_demonstrations, missing_dataset
 from sb3_chac.common.utils import minimize
 from sb3_chac.gail.discriminator import Discriminator, discriminator_loss, imitation_rewards
 
@@ -194,9 +194,7 @@ class GAIL(CheckedRollouts, PPO):
 
     @staticmethod
     def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
-        check_spaces(env.observation_space, env.action_space)
-        if isinstance(env.action_space, spaces.Box):
-            check_action_space(env.action_space)
+        check_imitable(env)
         return BaseAlgorithm._wrap_env(env, verbose, monitor_wrapper)
 
     def set_dataset(self, dataset: Dataset | None) -> None:

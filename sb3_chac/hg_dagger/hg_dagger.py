@@ -197,7 +197,7 @@ class HGDagger(GuidedOffPolicyAlgorithm):
 
     @property
     def is_finished(self) -> bool:
-        """Whether all rounds were made."""
+        """Tell whether all rounds were made."""
         return self.n_rounds is not None and self.round > self.n_rounds
 
     def _is_round_over(self) -> bool:

@@ -1,8 +1,6 @@
-"""Who drives during a takeover: a scripted driver, a trained model or any function of the observation."""
+"""Experts, which drive during a takeover: a scripted driver, a trained model or any function of the observation."""
 
 import os
-import queue
-import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Protocol
@@ -18,7 +16,7 @@ from sb3_chac.common.naming import is_name, named_object
 
 
 class Expert(Protocol):
-    """What drives in the human's place. It may also have ``time_to_trouble(observation, action)``, see ``RiskRule``."""
+    """Driver in the human's place. It may also have ``time_to_trouble(observation, action)``, see ``RiskRule``."""
 
     def reset(self, seed: int | None = None) -> None:
         """
@@ -82,34 +80,6 @@ class ModelExpert:
         return action[()]  # a discrete action as a number
 
 
-def within(seconds: float | None, function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
-    """
-    Call a function with a deadline.
-
-    :param seconds: that the function has, None for as long as it needs
-    :return: what it returns
-    :raises TimeoutError: if it is late; its thread is left to itself
-    """
-    if seconds is None:
-        return function(*args, **kwargs)
-    answer: queue.SimpleQueue[tuple[Any, BaseException | None]] = queue.SimpleQueue()
-
-    def ask() -> None:
-        try:
-            answer.put((function(*args, **kwargs), None))
-        except BaseException as error:  # for who waits
-            answer.put((None, error))
-
-    threading.Thread(target=ask, daemon=True).start()
-    try:
-        value, error = answer.get(timeout=seconds)
-    except queue.Empty:
-        raise TimeoutError(f"there was no answer within {seconds:g} s") from None
-    if error is not None:
-        raise error
-    return value
-
-
 def make_expert(expert: Any, env: gym.Env) -> Expert:
     """
     Make an expert of a name, a model or a function.
@@ -136,7 +106,7 @@ def make_expert(expert: Any, env: gym.Env) -> Expert:
 
 def check_expert(expert: Any, env: gym.Env) -> None:
     """
-    What can be checked without building the expert; whether ``env`` knows a name shows in ``make_expert``.
+    Check what can be checked without building the expert; whether ``env`` knows a name shows in ``make_expert``.
 
     :raises ValueError: see ``make_expert``
     """

@@ -13,20 +13,13 @@ from gymnasium.utils import RecordConstructorArgs
 from sb3_chac.common import contract
 from sb3_chac.common.arguments import checked
 from sb3_chac.common.checks import check_action_space, check_integer, check_range
-from sb3_chac.human.experts import Expert, check_expert, expert_name, make_expert, within
-from sb3_chac.human.rules import TakeoverRule, check_rule, make_rule, scale_action
-
-
-class ExpertError(RuntimeError):
-    """Raised when the expert fails or hands in something that is no action. The environment has not made the step."""
-
-
-class RuleError(RuntimeError):
-    """Raised when the rule fails or does not say who drives. The environment has not made the step."""
+from sb3_chac.human.experts import check_expert
+from sb3_chac.human.rules import check_rule
+from sb3_chac.human.supervisor import Supervisor
 
 
 class ControlState(StrEnum):
-    """Who has control. An environment that is not armed stays AUTONOMOUS."""
+    """States of control. An environment that is not armed stays AUTONOMOUS."""
 
     AUTONOMOUS = "autonomous"  # the novice drives and the human watches
     TAKEOVER = "takeover"  # the human drives
@@ -118,11 +111,8 @@ class InterventionWrapper(contract.TakeoverWrapper, RecordConstructorArgs):
             check_integer("budget", budget, low=0)
         if deadline is not None:
             check_range("deadline", deadline, low=0.0, exclusive_low=True)
-        self.budget, self.deadline = budget, deadline
-        self._expert_argument, self._rule_arguments = expert, (rule, rule_kwargs)
-        self._rule_in_force = self._rule_arguments
-        self._expert: Expert | None = None  # both are built when first armed
-        self._rule: TakeoverRule | None = None
+        self.budget = budget
+        self._supervisor = Supervisor(expert, rule, rule_kwargs, deadline, self._box)  # builds them when first armed
         self._armed = False
         self._step_by_step = False
         self._is_granted = self._may_drive = False  # of the next step, see ``begin_step``
@@ -139,28 +129,38 @@ class InterventionWrapper(contract.TakeoverWrapper, RecordConstructorArgs):
             self.arm()
 
     @property
+    def deadline(self) -> float | None:
+        """Seconds that expert and rule have for each answer, None for as long as they need."""
+        return self._supervisor.deadline
+
+    @property
     def armed(self) -> bool:
+        """Tell whether the human watches."""
         return self._armed
 
     @property
     def state(self) -> ControlState:
+        """State of control."""
         return self._state
 
     @property
     def human_steps(self) -> int:
+        """Number of steps that the human drove so far."""
         return self._human_steps
 
     @property
     def total_steps(self) -> int:
+        """Number of steps made while armed so far."""
         return self._total_steps
 
     @property
     def takeover_rate(self) -> float:
+        """Share of the steps made while armed that the human drove."""
         return self._human_steps / self._total_steps if self._total_steps else 0.0
 
     def arm(self, step_by_step: bool = False) -> None:
         """
-        From the next step on the human watches, also in the middle of an episode. If armed already, it goes on as it is.
+        Let the human watch from the next step on, also in the middle of an episode. If armed already, it goes on as it is.
 
         :param step_by_step: only in the steps that ``begin_step`` announces; in all others the wrapper is inert. That also
             holds for a wrapper that is armed already
@@ -169,11 +169,7 @@ class InterventionWrapper(contract.TakeoverWrapper, RecordConstructorArgs):
         if self._armed:
             self._step_by_step |= step_by_step
             return
-        if self._expert is None or self._rule is None:
-            expert = make_expert(self._expert_argument, self.env)
-            rule, rule_kwargs = self._rule_in_force
-            self._rule = make_rule(rule, self.env, expert, rule_kwargs)
-            self._expert = expert
+        self._supervisor.build(self.env)
         self._step_by_step = step_by_step
         if self._budget_is_spent():
             self._on("pause")
@@ -195,28 +191,23 @@ class InterventionWrapper(contract.TakeoverWrapper, RecordConstructorArgs):
         return made
 
     def disarm(self) -> None:
-        """Ends a takeover and a pause; from the next step on the wrapper is inert. The counts are kept."""
+        """End a takeover and a pause; from the next step on the wrapper is inert. The counts are kept."""
         self._on("hand back")
         self._on("resume")
         self._armed = self._has_to_start = self._is_granted = False
 
     def set_rule(self, rule: Any = None) -> None:
         """
-        From the next step on another rule decides, e.g. "always" while the human demonstrates.
+        Change the rule from the next step on, e.g. to "always" while the human demonstrates.
 
         :param rule: see ``make_rule``; None for the rule that the wrapper was made with
         :raises ValueError: for a rule that does not fit; nothing is changed then
         """
-        rule, rule_kwargs = in_force = self._rule_arguments if rule is None else (rule, None)
-        check_rule(rule, self._expert_argument, rule_kwargs)
-        if self._expert is not None:
-            self._rule = make_rule(rule, self.env, self._expert, rule_kwargs)
-            self._rule.reset()
-        self._rule_in_force = in_force
+        self._supervisor.set_rule(rule, self.env)
 
     def pause(self) -> None:
         """
-        The human is no longer asked, which ends a takeover; steps go on counting.
+        Stop asking the human, which ends a takeover; steps go on counting.
 
         :raises RuntimeError: if the wrapper is not armed
         """
@@ -225,7 +216,7 @@ class InterventionWrapper(contract.TakeoverWrapper, RecordConstructorArgs):
 
     def resume(self) -> None:
         """
-        The human is asked again, unless the budget is spent.
+        Ask the human again, unless the budget is spent.
 
         :raises RuntimeError: if the wrapper is not armed
         """
@@ -263,8 +254,8 @@ class InterventionWrapper(contract.TakeoverWrapper, RecordConstructorArgs):
 
         drives, executed, applied_action = False, action, novice_action
         if watches and self._state is not ControlState.PAUSED and (self._may_drive or not self._step_by_step):
-            expert_action = self._ask_expert(observation)
-            drives = self._ask_rule(observation, novice_action, expert_action, was_driving)
+            expert_action = self._supervisor.act(observation)
+            drives = self._supervisor.drives(observation, novice_action, expert_action, was_driving)
             if drives:
                 executed, applied_action = expert_action.copy(), expert_action
         observation, reward, terminated, truncated, info = self.env.step(executed)
@@ -318,7 +309,7 @@ class InterventionWrapper(contract.TakeoverWrapper, RecordConstructorArgs):
 
     @property
     def hud(self) -> dict[str, Any]:
-        """What a ``TakeoverDisplay`` may show."""
+        """Values for a ``TakeoverDisplay``."""
         return {
             "takeover": self._state is ControlState.TAKEOVER,
             "steps": self._total_steps,
@@ -370,69 +361,12 @@ class InterventionWrapper(contract.TakeoverWrapper, RecordConstructorArgs):
             self._start()
 
     def _start(self) -> None:
-        """Tells expert and rule that they are asked from now on; before the first reset() there is nothing to look at yet."""
+        """Tell expert and rule that they are asked from now on; before the first reset() there is nothing to look at yet."""
         if self._observation is None:
             return
-        assert self._expert is not None and self._rule is not None
         observation, self._observation = self._observation, None  # stays None if anything fails
-        try:
-            within(self.deadline, self._expert.reset, seed=self._seed)
-        except Exception as error:
-            raise self._expert_error(f"raised {type(error).__name__} in its reset: {error}.") from error
-        try:
-            within(self.deadline, self._rule.reset)
-        except Exception as error:
-            raise self._rule_error(f"raised {type(error).__name__} in its reset: {error}.") from error
+        self._supervisor.reset(self._seed)
         self._observation, self._seed = observation, None
-
-    def _ask_expert(self, observation: Any) -> np.ndarray:
-        """
-        Ask the expert for an action and check it.
-
-        :return: the expert's action, within the bounds and of the dtype of the action space
-        """
-        assert self._expert is not None
-        try:
-            values = np.array(within(self.deadline, self._expert, copy.deepcopy(observation)), dtype=np.float64)
-        except Exception as error:
-            raise self._expert_error(f"raised {type(error).__name__}: {error}.") from error
-        low, high = self._box.low.astype(np.float64), self._box.high.astype(np.float64)
-        if values.shape != self._box.shape:
-            raise self._expert_error(f"returned shape {values.shape}, the action space has {self._box.shape}.")
-        if not np.isfinite(values).all():
-            raise self._expert_error(f"returned an action that is NaN or infinite: {values}.")
-        tolerance = 1e-6 * (high - low) / 2  # for rounding
-        if np.any((values < low - tolerance) | (values > high + tolerance)):
-            raise self._expert_error(f"returned an action out of bounds: {values} is not within {low} and {high}.")
-        values = np.clip(values, low, high)
-        is_integer = np.issubdtype(self._box.dtype, np.integer)
-        return (np.rint(values) if is_integer else values).astype(self._box.dtype)
-
-    def _expert_error(self, problem: str) -> ExpertError:
-        return ExpertError(
-            f"The {expert_name(self._expert_argument)} {problem} The environment did not make a step. Mend the expert or pass "
-            "another as expert=..., and go on with reset()."
-        )
-
-    def _ask_rule(self, observation: Any, novice_action: np.ndarray, expert_action: np.ndarray, was_driving: bool) -> bool:
-        assert self._rule is not None
-        # Copies: it may keep or change what it is given
-        asked = copy.deepcopy(observation), novice_action.copy(), expert_action.copy(), was_driving
-        try:
-            takeover = within(self.deadline, self._rule, *asked)
-        except Exception as error:
-            raise self._rule_error(f"raised {type(error).__name__}: {error}.") from error
-        if not isinstance(takeover, bool | np.bool_):
-            raise self._rule_error(f"must return True or False, got {takeover!r}.")
-        return bool(takeover)
-
-    def _rule_error(self, problem: str) -> RuleError:
-        rule = self._rule_in_force[0]
-        name = repr(rule) if isinstance(rule, str) else getattr(rule, "__qualname__", type(rule).__name__)
-        return RuleError(
-            f"The rule {name} {problem} The environment did not make a step. Mend the rule or pass another as rule=..., and "
-            "go on with reset()."
-        )
 
     def _checked_novice_action(self, action: Any) -> np.ndarray:
         if self._observation is None:
@@ -449,6 +383,6 @@ class InterventionWrapper(contract.TakeoverWrapper, RecordConstructorArgs):
         return array.astype(self._box.dtype)
 
     def _cosine_distance(self, novice_action: np.ndarray, expert_action: np.ndarray) -> float:
-        novice, expert = (scale_action(action, self._box).ravel() for action in (novice_action, expert_action))
+        novice, expert = (contract.scale_action(action, self._box).ravel() for action in (novice_action, expert_action))
         norms = np.linalg.norm(novice) * np.linalg.norm(expert)
         return float(np.clip(1 - novice @ expert / norms, 0, 2)) if norms > 0 else 0.0

@@ -1,4 +1,4 @@
-"""When the human drives: takeover rules, from the observation and from what novice and expert would do."""
+"""Takeover rules: when the human drives, from the observation and from what novice and expert would do."""
 
 import copy
 import math
@@ -11,6 +11,7 @@ from gymnasium import spaces
 
 from sb3_chac.common.arguments import checked
 from sb3_chac.common.checks import check_action_space, check_integer, check_range
+from sb3_chac.common.contract import scale_action
 from sb3_chac.common.naming import is_name, named_object
 
 RULE_NAMES = ("risk", "disagreement", "always", "never")
@@ -18,7 +19,7 @@ RULE_NAMES = ("risk", "disagreement", "always", "never")
 
 @runtime_checkable
 class TakeoverRule(Protocol):
-    """Decides who drives. One object serves one environment, as it may remember."""
+    """Rule that decides who drives. One object serves one environment, as it may remember."""
 
     def reset(self) -> None:
         """Forget: a new episode starts, or the human is asked again after a break."""
@@ -160,18 +161,6 @@ def never(observation: Any, novice_action: np.ndarray, expert_action: np.ndarray
     return False
 
 
-def scale_action(action: np.ndarray, action_space: spaces.Box) -> np.ndarray:
-    """
-    Scale an action.
-
-    :param action: in the units of the environment
-    :param action_space: a Box with finite bounds
-    :return: ``action`` with the bounds mapped to -1 and 1, in float64
-    """
-    low, high = action_space.low.astype(np.float64), action_space.high.astype(np.float64)
-    return 2 * (np.asarray(action, dtype=np.float64) - low) / (high - low) - 1
-
-
 def make_rule(rule: Any, env: gym.Env, expert: Any, rule_kwargs: dict[str, Any] | None = None) -> TakeoverRule:
     """
     Make a rule of a name or a function.
@@ -210,7 +199,7 @@ CONFIGURABLE: dict[str, Callable[..., TakeoverRule]] = {
 
 def check_rule(rule: Any, expert: Any, rule_kwargs: dict[str, Any] | None = None) -> None:
     """
-    What can be checked without building anything: the predictor of a scripted driver that is still a name is not.
+    Check what can be checked without building anything: the predictor of a scripted driver that is still a name is not.
 
     :param rule: see ``make_rule``
     :param expert: see ``make_expert``

@@ -44,7 +44,7 @@ class CostRolloutBuffer(RolloutBuffer):
 
     def add_costs(self, costs: np.ndarray, cost_values: th.Tensor) -> None:
         """
-        To be called before ``add``, for the same step.
+        Add the costs of a step; to be called before ``add``.
 
         :param costs: shape (n_envs,)
         :param cost_values: estimated value of the current state, shape (n_envs, 1)
@@ -56,7 +56,8 @@ class CostRolloutBuffer(RolloutBuffer):
         self, last_cost_values: th.Tensor, dones: np.ndarray, cost_gamma: float, cost_gae_lambda: float
     ) -> None:
         """
-        What ``compute_returns_and_advantage`` does with rewards: it is applied to a copy in which costs stand in their place.
+        Compute returns and advantages of the costs: SB3's method is applied to a copy in which costs stand in place of
+        rewards.
 
         :param last_cost_values: value of the state after the last step, shape (n_envs, 1)
         :param dones: whether an episode ended with it, shape (n_envs,)

@@ -48,7 +48,7 @@ class CostReplayBuffer(ReplayBuffer):
         infos: list[dict[str, Any]],
     ) -> None:
         """
-        As in SB3.
+        Add a transition as SB3 does.
 
         :raises ValueError: if a cost is missing; then nothing is stored
         """

@@ -1,7 +1,5 @@
 """SAC with a Lagrange multiplier on the safety cost (SAC-Lag)."""
 
-import io
-import pathlib
 import warnings
 from collections import defaultdict
 from typing import Any, ClassVar, TypeVar
@@ -103,6 +101,7 @@ class SACLag(CostConstrainedAlgorithm, CheckedOffPolicyAlgorithm, SAC):
         "MultiInputPolicy": MultiInputPolicy,
     }
     required_policy = SACLagPolicy
+    required_buffer = CostReplayBuffer
     policy: SACLagPolicy
     cost_critic: ContinuousCritic
     cost_critic_target: ContinuousCritic
@@ -221,18 +220,6 @@ class SACLag(CostConstrainedAlgorithm, CheckedOffPolicyAlgorithm, SAC):
         check_integer("lagrange_start", self.lagrange_start, low=0)
         initial_ent_coef(self.ent_coef)
         target_entropy(self.target_entropy, get_action_dim(self.action_space))
-
-    def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
-        """
-        As in SB3.
-
-        :raises ValueError: if it holds no costs; then nothing is changed
-        """
-        before = self.replay_buffer
-        super().load_replay_buffer(path, truncate_last_traj)
-        if not isinstance(self.replay_buffer, CostReplayBuffer):
-            other, self.replay_buffer = self.replay_buffer, before
-            raise ValueError(f"load_replay_buffer: {path} holds no CostReplayBuffer, got {type(other).__name__}.")
 
     def _store_transition(
         self,

@@ -1,4 +1,4 @@
-"""What RL-Zoo3's experiments do besides with our algorithms and environments: see the function of each method."""
+"""Hooks added to RL-Zoo3's ExperimentManager for our algorithms and environments: see the function of each method."""
 
 import atexit
 import contextlib
@@ -17,20 +17,13 @@ from stable_baselines3.common.callbacks import ProgressBarCallback
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
 from sb3_chac.common.callbacks import PROGRESS_FILE, CSVProgress, GuidedProgressBar, SafetyCost
-from sb3_chac.common.checkpoints import (
-    DamagedCheckpoint,
-    ResumableCheckpoint,
-    StopSignals,
-    TrainingStopped,
-    checkpoint_step,
-    stored_rows,
-    verify,
-)
+from sb3_chac.common.checkpoint_files import DamagedCheckpoint, checkpoint_step, stored_rows, verify
+from sb3_chac.common.checkpoints import ResumableCheckpoint, StopSignals, TrainingStopped
 from sb3_chac.common.guided import GuidedOffPolicyAlgorithm
 from sb3_chac.common.lagrange import CostConstrainedAlgorithm
 from sb3_chac.common.offline import OfflineAlgorithm
 from sb3_chac.envs import ENVIRONMENTS, ONE_PER_PROCESS, VALIDATION
-from sb3_chac.human.intervention import ExpertError, RuleError
+from sb3_chac.human.supervisor import ExpertError, RuleError
 from sb3_chac.zoo.algorithms import ALGORITHMS, hyperparams_file
 from sb3_chac.zoo.errors import check_file, check_hyperparameters, check_options, evaluating, one_line
 
@@ -122,7 +115,7 @@ def setup_experiment(original: Callable[..., Any], manager: Any) -> Any:
 
 
 def create_envs(original: Callable[..., Any], manager: Any, *args: Any, **kwargs: Any) -> Any:
-    """Processes of environments leave signals to the one that trains: a terminal sends Ctrl-C to all of them."""
+    """Create environments, whose processes leave signals to the one that trains: a terminal sends Ctrl-C to all of them."""
     if not is_ours(manager) or manager.vec_env_class is not SubprocVecEnv:
         return original(*args, **kwargs)
     before = {number: signal.signal(number, signal.SIG_IGN) for number in (signal.SIGINT, signal.SIGTERM)}
@@ -189,8 +182,8 @@ def save_config(original: Callable[..., None], manager: Any, saved_hyperparams: 
 
 def learn(original: Callable[..., None], manager: Any, model: Any) -> None:
     """
-    From a checkpoint on, only the steps that remain of the total are made, and counted on. SIGTERM and Ctrl-C end the training
-    after a checkpoint, if it writes any.
+    Learn, from a checkpoint on only the steps that remain of the total. SIGTERM and Ctrl-C end the training after a
+    checkpoint, if it writes any.
     """
     if is_ours(manager):
         with one_line_of(manager, OSError, ValueError, ExpertError, RuleError):

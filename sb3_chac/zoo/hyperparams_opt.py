@@ -205,6 +205,7 @@ def sample_dagger_params(trial: optuna.Trial, n_actions: int, n_envs: int, addit
     return params | {"n_epochs": trial.suggest_int("n_epochs", 5, 80, log=True)}
 
 
+# Algorithms that are not listed search as the nearest one does that they derive from
 HYPERPARAMS_SAMPLER: dict[str, Callable[..., dict[str, Any]]] = {
     "dsac": sample_dsac_params,
     "pvp": sample_pvp_params,
@@ -216,11 +217,10 @@ HYPERPARAMS_SAMPLER: dict[str, Callable[..., dict[str, Any]]] = {
     "cql": sample_cql_params,
     "gail": sample_gail_params,
     "hg_dagger": sample_dagger_params,
-    "iwr": sample_dagger_params,
 }
 HYPERPARAMS_CONVERTER: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
     **dict.fromkeys(HYPERPARAMS_SAMPLER, convert_offpolicy_params),
     "ppo_lag": convert_onpolicy_params,
     "gail": convert_onpolicy_params,
-    **dict.fromkeys(("bc", "hg_dagger", "iwr"), convert_bc_params),
+    **dict.fromkeys(("bc", "hg_dagger"), convert_bc_params),
 }

@@ -1,4 +1,4 @@
-"""What RL-Zoo3 has to be told of our algorithms, and gymnasium of our environments."""
+"""Registration of our algorithms with RL-Zoo3, and of our environments with gymnasium."""
 
 import contextlib
 import functools
@@ -48,15 +48,21 @@ def add_algorithms(utils: ModuleType) -> None:
 
 def add_experiments(exp_manager: ModuleType) -> None:
     """
-    Extend RL-Zoo3's experiments.
+    Extend RL-Zoo3's experiments. An algorithm without a search space gets that of the nearest one that it derives from.
 
     :param exp_manager: ``rl_zoo3.exp_manager``
     """
     from sb3_chac.zoo.experiments import extend
     from sb3_chac.zoo.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 
-    exp_manager.HYPERPARAMS_SAMPLER.update(HYPERPARAMS_SAMPLER)
-    exp_manager.HYPERPARAMS_CONVERTER.update(HYPERPARAMS_CONVERTER)
+    samplers, converters = exp_manager.HYPERPARAMS_SAMPLER, exp_manager.HYPERPARAMS_CONVERTER
+    samplers.update(HYPERPARAMS_SAMPLER)
+    converters.update(HYPERPARAMS_CONVERTER)
+    names = {algorithm: algo for algo, algorithm in exp_manager.ALGOS.items()}
+    for algo in ALGORITHMS.keys() - samplers.keys():
+        parent = next((names[base] for base in exp_manager.ALGOS[algo].__mro__ if names.get(base) in samplers), None)
+        if parent is not None:
+            samplers[algo], converters[algo] = samplers[parent], converters[parent]
     extend(exp_manager.ExperimentManager)
 
 

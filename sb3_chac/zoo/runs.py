@@ -7,7 +7,7 @@ import sys
 import zipfile
 from pathlib import Path
 
-from sb3_chac.common.checkpoints import FOLDER, checkpoints, sound_checkpoint
+from sb3_chac.common.checkpoint_files import FOLDER, checkpoints, sound_checkpoint
 
 
 class NotResumable(ValueError):

@@ -1,4 +1,4 @@
-"""What a person drives with: keyboard, gamepad, steering wheel, a page in a browser."""
+"""Devices to drive with: keyboard, gamepad, steering wheel, a page in a browser."""
 
 from sb3_chac.cockpit.devices.base import Clock, Command, Device, DeviceError, DriverInput
 from sb3_chac.cockpit.devices.calibration import Calibration

@@ -13,7 +13,7 @@ class DeviceError(ValueError):
 
 
 class DriverInput(NamedTuple):
-    """What the person at the wheel wants, at one moment."""
+    """Input of the person at the wheel, at one moment."""
 
     steering: float  # -1 (left) to 1 (right)
     pedals: float  # -1 (full brake) to 1 (full throttle)
@@ -23,7 +23,7 @@ class DriverInput(NamedTuple):
 
 
 class Command(StrEnum):
-    """What a person may want besides driving."""
+    """Commands of a person besides driving."""
 
     PAUSE = "pause"  # or go on
     SKIP = "skip"  # to the next episode
@@ -46,7 +46,7 @@ class Device(Protocol):
         """
 
     def read(self) -> DriverInput:
-        """What the person wants now."""
+        """Return what the person wants now."""
 
     def hand_back(self) -> None:
-        """The takeover is over, whatever the person holds."""
+        """End the takeover, whatever the person holds."""

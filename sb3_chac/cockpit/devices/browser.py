@@ -1,11 +1,8 @@
-"""A person at the wheel in a browser: where the page is served, its messages, and the device that they make."""
+"""A person at the wheel in a browser: the messages of the page, and the device that they make."""
 
-import ipaddress
 import json
 import math
-import socket
 import time
-from contextlib import suppress
 from typing import Any, Literal, NamedTuple
 
 from sb3_chac.cockpit.devices import GAMEPAD, Clock, Command, DriverInput, Pedal, Ramps
@@ -17,72 +14,14 @@ TRIGGER = Pedal(0, 0.0, 1.0)  # as browsers report them
 MOMENT = 1.0  # [s] from the last touch until a takeover that began with one is handed back
 
 
-class Address(NamedTuple):
-    """Where the cockpit is served."""
-
-    host: str
-    port: int
-
-    @property
-    def is_loopback(self) -> bool:
-        return self.host == "localhost" or (is_number(self.host) and ipaddress.ip_address(self.host).is_loopback)
-
-    def from_elsewhere(self) -> "Address":
-        """
-        The address as other machines use it.
-
-        :return: itself, but with this machine's address in its network in place of "all addresses"
-        """
-        if not (is_number(self.host) and ipaddress.ip_address(self.host).is_unspecified):
-            return self
-        own, anywhere = ("::1", "2001:db8::1") if ":" in self.host else ("127.0.0.1", "192.0.2.1")
-        with (
-            suppress(OSError),
-            socket.socket(socket.AF_INET6 if ":" in self.host else socket.AF_INET, socket.SOCK_DGRAM) as out,
-        ):
-            out.connect((anywhere, 9))  # sends nothing, but chooses the way there
-            own = out.getsockname()[0]
-        return Address(own, self.port)
-
-    def url(self, token: str, scheme: str = "http") -> str:
-        host = f"[{self.host}]" if ":" in self.host else self.host
-        return f"{scheme}://{host}:{self.port}/?token={token}"
-
-
-def parse_address(text: str) -> Address:
-    """
-    Parse the address to serve on.
-
-    :param text: HOST:PORT or PORT (then on loopback)
-    :raises ValueError: if it is neither
-    """
-    host, _, port = text.rpartition(":")
-    host = host.removeprefix("[").removesuffix("]") or "127.0.0.1"
-    if not port.isascii() or not port.isdecimal() or len(port) > 5 or int(port) > 65535:
-        raise ValueError(f"--serve must be PORT or HOST:PORT, for example 127.0.0.1:8000, got {text!r}.")
-    return Address(host, int(port))
-
-
-def is_number(host: str) -> bool:
-    """
-    Tell IP addresses from names.
-
-    :return: whether it is an IP address, not a name
-    """
-    with suppress(ValueError):
-        ipaddress.ip_address(host)
-        return True
-    return False
-
-
 class BadMessage(ValueError):
     """Raised for a message that the page does not send."""
 
 
 class Held(NamedTuple):
     """
-    What the driver holds: keys, a gamepad if there is one (stick to the right, right trigger, left trigger), and while the
-    screen is touched, steering (-1 left to 1 right) and pedals (-1 brake to 1 throttle) of its pads.
+    Controls that the driver holds: keys, a gamepad if there is one (stick to the right, right trigger, left trigger), and
+    while the screen is touched, steering (-1 left to 1 right) and pedals (-1 brake to 1 throttle) of its pads.
     """
 
     keys: frozenset[str]
@@ -155,7 +94,7 @@ class Browser:
         self.taken = True
 
     def leave(self) -> None:
-        """Nobody is there any more. A takeover is not over by that."""
+        """Note that nobody is there any more. A takeover is not over by that."""
         self.taken, self.heard_at, self.time = False, -math.inf, -math.inf
         self.go_away()
 

@@ -10,8 +10,8 @@ from sb3_chac.cockpit.devices.config import WHEEL, JoystickConfig, Pedal
 
 class Calibration:
     """
-    Finds out what the axes and buttons of a device report: one question after the other, each is answered by ``answer()``
-    when the person has done as asked. Buttons answer by being pressed.
+    Dialogue that finds out what the axes and buttons of a device report: one question after the other, each is answered by
+    ``answer()`` when the person has done as asked. Buttons answer by being pressed.
 
     :param name: of the device
     """
@@ -42,7 +42,7 @@ class Calibration:
 
     @property
     def question(self) -> str | None:
-        """What the person is to do, None at the end."""
+        """Instruction to the person, None at the end."""
         return dict(self.QUESTIONS)[self.step] if self.step else None
 
     def handle(self, event: Any) -> None:

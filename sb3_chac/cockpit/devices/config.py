@@ -67,7 +67,7 @@ class Pedal:
 @dataclass(frozen=True)
 class JoystickConfig:
     """
-    Which axes and buttons of a gamepad or wheel do what.
+    Axes and buttons of a gamepad or wheel, and what they do.
 
     :param name: what to call it
     :param takeover: buttons that take over and hand back

@@ -7,7 +7,7 @@ import pygame
 
 class EmulatedJoystick:
     """
-    What ``Joystick`` opens in place of a real one.
+    Stand-in for the device that ``Joystick`` opens.
 
     :param instance_id: number under which its events come
     :param name: that it gives itself
@@ -25,8 +25,8 @@ class EmulatedJoystick:
 
 class DeviceEmulator:
     """
-    Makes the events of a keyboard and of joysticks. By default they go into pygame's queue, from where the cockpit's window
-    takes them.
+    Source of the events of a keyboard and of joysticks. By default they go into pygame's queue, from where the cockpit's
+    window takes them.
 
     :param post: takes an event
     """
@@ -65,7 +65,7 @@ class DeviceEmulator:
         self._post(pygame.WINDOWFOCUSLOST)
 
     def gain_focus(self) -> None:
-        """The window is in front again."""
+        """Bring the window to the front again."""
         self._post(pygame.WINDOWFOCUSGAINED)
 
     def open_joystick(self, device_index: int) -> EmulatedJoystick:
@@ -73,12 +73,12 @@ class DeviceEmulator:
         return self.joystick
 
     def plug(self) -> None:
-        """A joystick is plugged in; it is another one than before."""
+        """Plug in a joystick; it is another one than before."""
         self.joystick = EmulatedJoystick(self.joystick.instance_id + 1, self.joystick.name)
         self._post(pygame.JOYDEVICEADDED, device_index=0)
 
     def unplug(self) -> None:
-        """The joystick is pulled out."""
+        """Pull the joystick out."""
         self._post(pygame.JOYDEVICEREMOVED, instance_id=self.joystick.instance_id)
 
     def axis(self, axis: int, value: float) -> None:

@@ -9,7 +9,7 @@ from sb3_chac.cockpit.devices.base import Clock, Command, DriverInput
 
 class Ramps:
     """
-    What held keys do to steering and pedals: they move steadily, and back when a key is let go. The brake is stronger than
+    Steering and pedals of held keys: they move steadily, and back when a key is let go. The brake is stronger than
     the throttle, and throttle and brake never act together.
 
     :param clock: [s]

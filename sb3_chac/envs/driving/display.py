@@ -1,4 +1,4 @@
-"""What the pictures of our environments share: their size, the window, and the panel with what happens."""
+"""Base of the pictures of our environments: their size, the window, and the panel with what happens."""
 
 from collections.abc import Callable, Iterable
 from typing import Any
@@ -23,7 +23,7 @@ PANEL, TEXT, PANEL_POSITION = (24, 27, 33), (235, 237, 240), (12, 12)
 
 class Display:
     """
-    Paints what the environment holds, and changes nothing of it: the same state gives the same picture. Needs no display
+    Painter of an environment. It changes nothing of what it paints: the same state gives the same picture. Needs no display
     unless a window is asked for.
 
     :param env: the environment to show, with ``hud`` (name -> value), ``scenario`` and ``steps``
@@ -84,6 +84,7 @@ class Display:
         self._shown = now
 
     def close(self) -> None:
+        """Close the window, if there is one."""
         if self.window is not None:
             self.window = None
             self.pygame.display.quit()
@@ -200,13 +201,13 @@ class Display:
         draw.rect(canvas, RED, canvas.get_rect(), 10 * FINE)
         draw.circle(canvas, RED, self._to_canvas(self.centre), 26 * FINE, 4 * FINE)
 
-    def _finish(self, info: dict[str, Any], flash: bool) -> None:
+    def _finish(self, info: dict[str, Any]) -> None:
         """
         Add signs of a collision and the panel.
 
         :param info: of the last step
-        :param flash: whether a collision is to be seen
         """
+        flash = any(self.env.steps - step < FLASH_STEPS for step in self.env._touched.values())
         if flash:
             self._paint_flash()
         self.pygame.transform.smoothscale(self.canvas, SIZE, self.picture)
@@ -265,5 +266,5 @@ def _text(value: Any) -> str:
 
 
 def turned(heading: float) -> np.ndarray:
-    """What turns rows (ahead, right) into rows (x, y)."""
+    """Return the rotation matrix that turns rows (ahead, right) into rows (x, y)."""
     return np.array([[np.cos(heading), np.sin(heading)], [-np.sin(heading), np.cos(heading)]])

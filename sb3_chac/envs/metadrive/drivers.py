@@ -1,4 +1,4 @@
-"""Who can drive in MetaDriveSafety-v0: the scripted driver, and MetaDrive's own two."""
+"""Drivers of MetaDriveSafety-v0: the scripted driver, and MetaDrive's own two."""
 
 from typing import TYPE_CHECKING, Any
 

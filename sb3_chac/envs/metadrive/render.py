@@ -8,7 +8,6 @@ import numpy as np
 from sb3_chac.envs.driving.display import (
     ASPHALT,
     FINE,
-    FLASH_STEPS,
     LINE,
     PARKED,
     RED,
@@ -60,7 +59,7 @@ class Viewer(Display):
         self._paint_vehicle(self.centre, -ego.heading_theta, self._ego_colour, steering, (ego.LENGTH, ego.WIDTH))
         for kind, position in signs:
             self._paint_sign(kind, self._to_canvas(position))
-        self._finish(env.last_info, any(env.steps - step < FLASH_STEPS for step in env._touched.values()))
+        self._finish(env.last_info)
 
     def _areas(self) -> Iterable[Area]:
         for patch in patches(self.env):

@@ -1,4 +1,4 @@
-"""What a map of MetaDrive looks like: lanes and lines as polygons."""
+"""Lane and marking polygons of a MetaDrive map."""
 
 import itertools
 from collections.abc import Iterator

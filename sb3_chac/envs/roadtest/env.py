@@ -8,11 +8,13 @@ from gymnasium import spaces
 
 from sb3_chac.common.checks import check_integer, check_range
 from sb3_chac.envs.driving.geometry import SPACING, boxes_overlap
+from sb3_chac.envs.driving.layout import placed
 from sb3_chac.envs.driving.planner import Others
 from sb3_chac.envs.safedrive.driver import IMPERFECTIONS, ScriptedDriver
-from sb3_chac.envs.safedrive.env import SafeDriveEnv, Scene
+from sb3_chac.envs.safedrive.env import SafeDriveEnv
 from sb3_chac.envs.safedrive.geometry import Pose
 from sb3_chac.envs.safedrive.map import HALF_WIDTH, length
+from sb3_chac.envs.safedrive.scene import Scene
 from sb3_chac.envs.safedrive.vehicle import MAX_SPEED
 
 ROUTES = {1: "SXCTSO", 2: "CTSXCO"}  # blocks of the routes, which are the scenarios
@@ -29,7 +31,7 @@ TRIGGER = 25.0, 45.0  # [m] ahead of the vehicle when somebody begins to cross
 
 
 class Kind(NamedTuple):
-    """Who crosses."""
+    """Kind of those who cross."""
 
     name: str
     length: float  # [m]
@@ -107,11 +109,7 @@ class RoadTestEnv(SafeDriveEnv):
             ("checkpoints", 2 * N_CHECKPOINTS, "m", "2, 4, ..., 60 m ahead: ahead and to the right of the vehicle, d / 60"),
             ("lidar", self.lidar.rays, "m", "closeness 1 - d / 50, clockwise from straight ahead"),
         ]
-        result, start = [], 0
-        for name, size, unit, meaning in parts:
-            result.append({"name": name, "start": start, "stop": start + size, "unit": unit, "meaning": meaning})
-            start += size
-        return result
+        return placed(parts)
 
     def _scene(self, scenario: int) -> Scene:
         self._check_route("options['scenario']", scenario)
@@ -182,7 +180,7 @@ class RoadTestEnv(SafeDriveEnv):
 
     @property
     def command(self) -> str:
-        """What the driver is told for the next junction: "left", "straight" or "right"."""
+        """Command for the next junction: "left", "straight" or "right"."""
         s = 0.0
         for block in self.map.blocks:
             start, s = s, s + length(block.route)

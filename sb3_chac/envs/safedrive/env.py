@@ -2,7 +2,7 @@
 
 import math
 from collections import OrderedDict
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
@@ -17,26 +17,17 @@ from sb3_chac.envs.driving.env import DrivingEnv
 from sb3_chac.envs.driving.geometry import boxes_overlap
 from sb3_chac.envs.safedrive.driver import IMPERFECTIONS, ScriptedDriver
 from sb3_chac.envs.safedrive.geometry import Pose
+from sb3_chac.envs.safedrive.layout import layout
 from sb3_chac.envs.safedrive.lidar import Lidar
-from sb3_chac.envs.safedrive.map import BLOCKS, HALF_WIDTH, LANES, OBSTACLE_SIZES, Map
+from sb3_chac.envs.safedrive.map import BLOCKS, HALF_WIDTH, LANES, Map
 from sb3_chac.envs.safedrive.navigation import N_EGO, N_STATE, locate, navigation, route_ahead
-from sb3_chac.envs.safedrive.traffic import CAR_LENGTH, CAR_WIDTH, Traffic
+from sb3_chac.envs.safedrive.scene import Scene, make_scene
+from sb3_chac.envs.safedrive.traffic import CAR_LENGTH, CAR_WIDTH
 from sb3_chac.envs.safedrive.vehicle import MAX_SPEED, Ego
 
 SUBSTEPS = 2
 PARKED_TOWED_AFTER = 50  # steps after a collision with a parked vehicle
 SCENES_KEPT = 64
-
-
-class Scene(NamedTuple):
-    """What a scenario number stands for."""
-
-    map: Map
-    traffic: Traffic
-    lane: float  # [m] offset of the lane in which the ego starts
-    obstacle_positions: np.ndarray
-    obstacle_headings: np.ndarray
-    obstacle_sizes: np.ndarray  # length and width
 
 
 class SafeDriveEnv(DrivingEnv):
@@ -172,19 +163,11 @@ class SafeDriveEnv(DrivingEnv):
     # Scenes
 
     def _scene(self, scenario: int) -> Scene:
-        """The scene of a scenario, made when it is first needed."""
+        """Return the scene of a scenario, made when it is first needed."""
         if scenario in self._scenes:
             self._scenes.move_to_end(scenario)
             return self._scenes[scenario]
-        road_map = Map(scenario, self.blocks, self.obstacle_density)
-        rng = np.random.default_rng([abs(scenario), int(scenario < 0), 1])
-        lane = float(rng.choice(LANES))
-        traffic = Traffic(road_map, self.traffic_density, rng)
-        obstacles = road_map.obstacles
-        s, lateral = np.array([(o.s, o.lateral) for o in obstacles]).reshape(-1, 2).T
-        positions, headings = traffic.poses(np.zeros(len(s), dtype=int), s, lateral)
-        sizes = np.array([OBSTACLE_SIZES[o.kind] for o in obstacles]).reshape(-1, 2)
-        self._scenes[scenario] = Scene(road_map, traffic, lane, positions, headings, sizes)
+        self._scenes[scenario] = make_scene(scenario, self.blocks, self.obstacle_density, self.traffic_density)
         if len(self._scenes) > SCENES_KEPT:
             self._scenes.popitem(last=False)
         return self._scenes[scenario]
@@ -259,11 +242,11 @@ class SafeDriveEnv(DrivingEnv):
         return action
 
     def _locate(self) -> None:
-        """Where the ego is on the route, looked for close to where it was (the route may pass near itself)."""
+        """Find where the ego is on the route, close to where it was (the route may pass near itself)."""
         self.s, self.lateral, self.heading_error = locate(self.map.route, self.s, self.ego.position, self.ego.heading)
 
     def _find_boxes(self) -> None:
-        """Everything that can be hit or seen: first the cars of the traffic that are there, then the obstacles."""
+        """Collect everything that can be hit or seen: first the cars of the traffic that are there, then the obstacles."""
         traffic, scene = self.traffic, self.scene
         obstacles = scene.obstacle_positions, scene.obstacle_headings, scene.obstacle_sizes, traffic.obstacle_there
         self.box_positions, self.box_headings, self.box_lengths, self.box_widths = _boxes(
@@ -397,38 +380,6 @@ class SafeDriveEnv(DrivingEnv):
         return self._road[1]
 
     _road: tuple[Map, Road] | None = None
-
-
-def layout(rays: int, corridors: bool) -> list[dict[str, Any]]:
-    """
-    Describe the numbers of an observation.
-
-    :param rays: of the lidar
-    :param corridors: whether they follow
-    :return: of an observation, see ``SafeDriveEnv.observation_layout``; t is tanh
-    """
-    parts = [
-        ("left_edge", 1, "m", "distance d to the left edge of the carriageway, d / 4 - 1"),
-        ("right_edge", 1, "m", "distance d to the right edge of the carriageway, d / 4 - 1"),
-        ("heading_error", 1, "rad", "heading against the route, t(angle / 0.15)"),
-        ("speed", 1, "m/s", f"2 v / {MAX_SPEED:g} - 1"),
-        ("steering_angle", 1, "rad", "angle of the front wheels, positive to the right, t(angle / 0.15)"),
-        ("last_action", 2, "1", "last action"),
-        ("yaw_rate", 1, "rad/s", "positive to the right, t(rate / 0.3)"),
-        ("lane_offset", 1, "m", "offset from the middle of the nearest lane, to the right, t(d / 0.5)"),
-        ("checkpoints", N_STATE - N_EGO, "rad", "8, 16, 26, 38, 50 m ahead: bearing t(angle / 0.4), heading t(angle / 0.6)"),
-        ("lidar", rays, "m", "closeness 1 - d / 50, clockwise from straight ahead"),
-    ]
-    if corridors:
-        parts += [
-            ("corridors", N_VIEW // 2, "m", "closeness 1 - d / 40 in arcs, then in strips along the route"),
-            ("corridor_changes", N_VIEW // 2, "m", "change of each free distance since the observation before, d / 1.5"),
-        ]
-    result, start = [], 0
-    for name, size, unit, meaning in parts:
-        result.append({"name": name, "start": start, "stop": start + size, "unit": unit, "meaning": meaning})
-        start += size
-    return result
 
 
 @compiled

@@ -33,6 +33,11 @@ class Segment(NamedTuple):
     curvature: float = 0.0
 
     def end(self, start: Pose) -> Pose:
+        """
+        Return where it ends.
+
+        :param start: where it begins
+        """
         if self.curvature == 0:
             return start.shifted(self.length)
         angle = self.length * self.curvature
@@ -49,6 +54,7 @@ class Segment(NamedTuple):
         return Segment(self.length * shrink, self.curvature / shrink)
 
     def reverse(self) -> "Segment":
+        """Return it as driven the other way."""
         return Segment(self.length, -self.curvature)
 
 

@@ -28,7 +28,7 @@ class Lidar:
         widths: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray]:
         """
-        Slab method: a ray is inside a box while it is between both pairs of its parallel sides.
+        Cast the rays by the slab method: a ray is inside a box while it is between both pairs of its parallel sides.
 
         :param position: of the lidar, shape (2,); ``heading`` is where ray 0 looks
         :param positions: centres of the boxes, shape (n, 2), with ``headings``, ``lengths`` and ``widths``, shape (n,)

@@ -73,10 +73,12 @@ class Block:
 
     @property
     def end(self) -> Pose:
+        """End of the block's route."""
         return chain(self.start, self.route)[-1]
 
     @property
     def half_size(self) -> float:
+        """[m] from the middle of a junction to its mouths."""
         return ROUNDABOUT if self.kind == "O" else CROSSING
 
     @property
@@ -267,7 +269,7 @@ class Map:
         return paths
 
     def _place_obstacles(self, rng: np.random.Generator, density: float) -> list[Obstacle]:
-        """Scenes in one lane at a time, on roads without junctions, far enough apart to pass them in turn."""
+        """Place obstacles in one lane at a time, on roads without junctions, far enough apart to pass them in turn."""
         obstacles: list[Obstacle] = []
         s, next_free = 0.0, START_STRAIGHT + 15.0
         for block in self.blocks:
@@ -293,6 +295,6 @@ class Map:
 
 
 def _lanes(arm: float, to: float) -> tuple[float, ...]:
-    """Who turns right keeps right, who turns left keeps left."""
+    """Return the lanes to take: keep right to turn right, left to turn left."""
     angle = wrap_angle(to - arm - np.pi)
     return LANES if abs(angle) < 0.1 else (LANES[int(angle > 0)],)

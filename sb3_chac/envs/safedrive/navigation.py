@@ -1,4 +1,4 @@
-"""Where the ego is on its route, and what its observation tells of the way ahead."""
+"""Position of the ego on its route, and the way ahead in its observation."""
 
 import numpy as np
 

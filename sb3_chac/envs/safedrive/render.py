@@ -10,7 +10,6 @@ from sb3_chac.envs.driving.display import (
     ASPHALT,
     BLACK,
     FINE,
-    FLASH_STEPS,
     GRASS,
     LINE,
     PARKED,
@@ -53,7 +52,6 @@ class Viewer(Display):
         self._look_along_route()
         self._paint_map(env.map, self._areas)
         self._paint_arrows()
-        flash = any(env.steps - step < FLASH_STEPS for step in env._touched.values())
         obstacles = []
         for (kind, index), position, heading in zip(env.box_ids, env.box_positions, env.box_headings, strict=True):
             if kind == "car":
@@ -69,7 +67,7 @@ class Viewer(Display):
         self._paint_vehicle(env.ego.position, env.ego.heading, self._ego_colour, env.ego.steering)
         for kind, position in obstacles:
             self._paint_sign(kind, self._to_canvas(position))
-        self._finish(env._info(), flash)
+        self._finish(env._info())
 
     def _look_along_route(self) -> None:
         """The direction of the route upwards: steadier than the ego's own heading."""
@@ -145,7 +143,7 @@ class Viewer(Display):
         self.pygame.draw.lines(self.canvas, colour, False, self._to_canvas(points).tolist(), 2 * FINE)
 
     def _paint_parked(self, position: np.ndarray, heading: float) -> None:
-        """With hazard lights."""
+        """Paint a parked vehicle, with hazard lights."""
         self._paint_vehicle(position, heading, PARKED)
         if self.env.steps // 4 % 2 == 0:
             corners = np.array([(2.3, 0.9), (2.3, -0.9), (-2.3, 0.9), (-2.3, -0.9)]) @ turned(heading)

@@ -111,7 +111,7 @@ def _split(block: Block) -> list[Segment]:
 
 
 def _junction_pieces(block: Block) -> list[tuple[Pose, Segment, bool]]:
-    """Where each piece of carriageway starts, its course, and whether it has markings."""
+    """List the pieces of carriageway: the start and course of each, and whether it has markings."""
     arms = [BEHIND, block.exit_arm, *block.side_arms]
     pieces = []
     for arm in block.side_arms:
@@ -130,12 +130,12 @@ def _junction_pieces(block: Block) -> list[tuple[Pose, Segment, bool]]:
 
 
 def _mouth(block: Block, arm: float) -> Pose:
-    """Where the axis of an arm meets the junction, heading outwards."""
+    """Return the pose in which the axis of an arm meets the junction, heading outwards."""
     return block.centre.shifted(0.0, 0.0, arm).shifted(block.half_size)
 
 
 def _entry(block: Block, arm: float) -> Pose:
-    """Where the middle of the carriageway that comes from an arm enters the junction."""
+    """Return the pose in which the middle of the carriageway from an arm enters the junction."""
     return _mouth(block, arm).shifted(0.0, -AXIS, np.pi)
 
 

@@ -107,7 +107,7 @@ class Traffic:
         return positions.reshape(*s.shape, 2), headings.reshape(s.shape)
 
     def update_visible(self) -> None:
-        """Where the cars are that one can see: ``visible`` (indices), ``positions`` and ``headings``."""
+        """Update what can be seen of the cars: ``visible`` (indices), ``positions`` and ``headings``."""
         self.visible, self.positions, self.headings = _visible(*self._tables, self.path, self.s, self.lateral, self.state)
 
     def crash(self, car: int) -> None:
@@ -115,7 +115,7 @@ class Traffic:
         self.state[car], self.speed[car] = CRASHED, 0.0
 
     def remove_obstacle(self, obstacle: int) -> None:
-        """It has fallen over, or was towed away."""
+        """Remove an obstacle: it has fallen over, or was towed away."""
         self.obstacle_there[obstacle] = False
 
     def step(
@@ -162,7 +162,7 @@ class Traffic:
         self.update_visible()
 
     def _appear(self, ego_s: float, ego_position: np.ndarray) -> None:
-        """Cars whose time has come, unless there is somebody in their place."""
+        """Let the cars appear whose time has come, unless there is somebody in their place."""
         waiting = np.flatnonzero((self.state == HIDDEN) & (self.trigger <= ego_s))
         if len(waiting) == 0:
             return
@@ -241,7 +241,7 @@ def _visible(points, first, last, path, s, lateral, state):
 @compiled
 def _pull_over(target, s, lateral, speed, shared, obstacles):
     """
-    Cars on the ego's route pass obstacles in the other lane.
+    Let cars on the ego's route pass obstacles in the other lane.
 
     :param target: [m] where the cars want to be, to the right of their path, shape (n,)
     :param shared: [m] from where to where everybody's path runs on the route, and how far the route is ahead of it
@@ -329,7 +329,8 @@ def _leader(i, tables, path, s, lateral, positions, cos, sin):
 @compiled
 def _yields(i, positions, headings, cos, sin, future):
     """
-    Who will be in the same place at the same time, coming from elsewhere: let go first who is farther ahead.
+    Tell whether to yield: of two that will be in the same place at the same time from different ways, the one farther ahead
+    goes first.
 
     :param future: positions at the times ``SOON``, shape (n + 1, len(SOON), 2)
     :return: whether car i lets anybody go first

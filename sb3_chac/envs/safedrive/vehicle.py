@@ -15,7 +15,8 @@ MAX_LATERAL_ACCELERATION = 7.0  # [m/s2]
 
 class Ego(Vehicle):
     """
-    It does not look for its lane on the map (the environment knows better), drives forward only, and goes on after a crash.
+    Vehicle that the agent drives. It does not look for its lane on the map (the environment knows better), drives forward
+    only, and goes on after a crash.
 
     :param pose: where it starts
     """
@@ -49,6 +50,7 @@ class Ego(Vehicle):
 
     @property
     def slip(self) -> float:
+        """[rad] angle between heading and motion."""
         return self.slip_at(self.steering, self.speed)
 
     @property
