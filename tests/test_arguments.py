@@ -8,6 +8,7 @@ import typing
 import gymnasium as gym
 import numpy as np
 import pytest
+from eleven import ALL, OFFLINE, Walk, make_any
 from gymnasium import spaces
 from test_zoo import swings
 
@@ -164,3 +165,43 @@ def test_schedules_are_looked_into(algorithm, name, schedule, is_good):
     else:
         with pytest.raises(ValueError, match=f"^{name} must be"):
             make()
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_arguments_of_learn_are_checked_before_anything_is_changed(name):
+    env = Walk()
+    env.reset()
+    model, position = make_any(name, env), env.position
+    bad = {
+        "total_timesteps": ["a", None, math.nan, math.inf, -1, 1.5, True, 1j, [3], 10**400],
+        "log_interval": ["a", 0, -1, math.nan, 2.5, 1j],
+        "callback": ["a", 3],
+        "reset_num_timesteps": ["no"],
+        "progress_bar": ["no"],
+    }
+    for argument, values in bad.items():
+        for value in values:
+            with pytest.raises(ValueError, match=f"^{argument} must be .*, got "):
+                model.learn(**{"total_timesteps": 6, argument: value})
+    assert model.num_timesteps == 0 and model._last_obs is None
+    assert env.position is position, "it was reset"
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_whole_numbers_of_any_type_are_a_number_of_steps(name):
+    model = make_any(name, Walk())
+    model.learn(0)
+    assert model.num_timesteps == 0
+    log_interval = 10 if name in OFFLINE else None
+    for steps in (12.0, np.float32(12), np.int64(12)):
+        model.learn(steps, log_interval=log_interval)
+        assert model.num_timesteps == 12
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_learning_without_an_environment_says_where_to_pass_one(name, tmp_path):
+    model = make_any(name, Walk())
+    model.save(tmp_path / "model")
+    loaded = type(model).load(tmp_path / "model", **({"dataset": model.dataset} if name in (*OFFLINE, "GAIL") else {}))
+    with pytest.raises(ValueError, match=rf"^env: pass it to {name}\.load\(\.\.\., env=\.\.\.\)"):
+        loaded.learn(10)

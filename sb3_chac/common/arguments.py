@@ -1,4 +1,4 @@
-"""Arguments of constructors, checked by what their signatures say of them, before anything is built."""
+"""Arguments of constructors and of ``learn``, checked by what their signatures say of them, before anything is changed."""
 
 import collections.abc
 import functools
@@ -16,7 +16,7 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.vec_env import VecEnv
 
-Init = TypeVar("Init", bound=Callable[..., None])
+Method = TypeVar("Method", bound=Callable[..., Any])
 
 
 class Range(NamedTuple):
@@ -52,44 +52,47 @@ RANGES = {
     "verbose": Range(0),
     "seed": Range(0, 2**32 - 1),
     "n_envs": Range(1),
+    "total_timesteps": Range(0),
+    "log_interval": Range(1),
 }
 
 
 SCHEDULES = ("clip_range", "clip_range_vf")  # that nobody else checks; they may end at 0
 
 
-def checked(init: Init) -> Init:
+def checked(method: Method) -> Method:
     """
-    Decorate a constructor, so that its arguments are checked against their annotations.
+    Decorate a constructor or ``learn``, so that its arguments are checked against their annotations.
 
-    :param init: ``__init__`` of a class. What does not fit the annotation of an argument, or is NaN or infinite, raises a
-        ``ValueError`` that begins with its name. Models that are being loaded get their arguments later and are left alone
+    :param method: ``__init__`` of a class, or its ``learn``. What does not fit the annotation of an argument, or is NaN or
+        infinite, raises a ``ValueError`` that begins with its name. Models that are being loaded get the arguments of their
+        constructor later and are left alone
     """
-    signature = inspect.signature(init)
+    signature = inspect.signature(method)
     hints: dict[str, Any] = {}
 
-    @functools.wraps(init)
-    def call(self: Any, *args: Any, **kwargs: Any) -> None:
+    @functools.wraps(method)
+    def call(self: Any, *args: Any, **kwargs: Any) -> Any:
         if kwargs.get("_init_setup_model", True):
             if not hints:  # now, as they may name what is defined after the class
-                hints.update(annotations(init))
+                hints.update(annotations(method))
             for name, value in signature.bind(self, *args, **kwargs).arguments.items():
                 if name in hints:
                     check_argument(name, value, hints[name])
                     check_name(type(self), name, value)
-        init(self, *args, **kwargs)
+        return method(self, *args, **kwargs)
 
-    return typing.cast(Init, call)
+    return typing.cast(Method, call)
 
 
-def annotations(init: Callable[..., None]) -> dict[str, Any]:
+def annotations(method: Callable[..., Any]) -> dict[str, Any]:
     """
-    Collect the annotations of the arguments of a constructor.
+    Collect the annotations of the arguments of a method.
 
     :return: those of the arguments, by name
     """
     # SB3's GymEnv names the first, a Dataset of demonstrations the others, which say themselves what is wrong with one
-    return typing.get_type_hints(init, localns={"VecEnv": VecEnv, "Demonstrations": Any, "MinariDataset": Any})
+    return typing.get_type_hints(method, localns={"VecEnv": VecEnv, "Demonstrations": Any, "MinariDataset": Any})
 
 
 def check_argument(name: str, value: Any, hint: Any) -> None:
@@ -101,6 +104,8 @@ def check_argument(name: str, value: Any, hint: Any) -> None:
     :param hint: its annotation
     :raises ValueError: unless they fit, and numbers are finite and within ``RANGES``
     """
+    if name == "total_timesteps" and isinstance(value, float | np.floating) and value.is_integer():
+        value = int(value)  # such as 1e5, which SB3 takes, too
     if not fits(value, hint):
         raise ValueError(f"{name} must be {describe(hint)}, got {value!r:.80}.")
     limits = RANGES.get(name)

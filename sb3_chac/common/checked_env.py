@@ -34,6 +34,16 @@ class CheckedVecEnv(VecEnvWrapper):
         return observations, rewards, dones, infos
 
 
+def check_env_is_there(model: BaseAlgorithm) -> None:
+    """
+    Check that a model can go on learning, one that was loaded.
+
+    :raises ValueError: if it has no environments
+    """
+    if model.env is None:
+        raise ValueError(f"env: pass it to {type(model).__name__}.load(..., env=...), or to set_env(), before learning.")
+
+
 def check_what_is_normalized(env: VecEnv, model: BaseAlgorithm) -> None:
     """
     ``VecNormalize`` clips what is infinite and takes what is NaN into its statistics for good. From now on what it is given

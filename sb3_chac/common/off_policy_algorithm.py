@@ -2,7 +2,7 @@
 
 import io
 import pathlib
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch as th
@@ -15,8 +15,8 @@ from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, TensorDict
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_chac.common.arguments import check_policy_kwargs
-from sb3_chac.common.checked_env import check_what_is_normalized
+from sb3_chac.common.arguments import check_policy_kwargs, checked
+from sb3_chac.common.checked_env import check_env_is_there, check_what_is_normalized
 from sb3_chac.common.checks import (
     MismatchedParameters,
     check_action_space,
@@ -28,6 +28,8 @@ from sb3_chac.common.checks import (
     check_step,
 )
 from sb3_chac.common.own_arrays import keep_last_observations
+
+SelfChecked = TypeVar("SelfChecked", bound="CheckedOffPolicyAlgorithm")
 
 
 class CheckedOffPolicyAlgorithm(OffPolicyAlgorithm):
@@ -68,6 +70,19 @@ class CheckedOffPolicyAlgorithm(OffPolicyAlgorithm):
     def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
         check_action_space(env.action_space)
         return BaseAlgorithm._wrap_env(env, verbose, monitor_wrapper)
+
+    @checked
+    def learn(
+        self: SelfChecked,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int | None = 4,
+        tb_log_name: str = "run",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> SelfChecked:
+        check_env_is_there(self)
+        return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)  # type: ignore[arg-type]
 
     def _setup_learn(
         self,

@@ -14,7 +14,8 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_chac.common.arguments import check_policy_kwargs
+from sb3_chac.common.arguments import check_policy_kwargs, checked
+from sb3_chac.common.checked_env import check_env_is_there
 from sb3_chac.common.checks import check_integer, check_learning_rate, check_policy, check_range
 from sb3_chac.common.demonstrations import Dataset, Demonstrations, check_imitable, load_demonstrations, missing_dataset
 from sb3_chac.common.utils import fix_statistics
@@ -195,13 +196,13 @@ class OfflineAlgorithm(BaseAlgorithm):
     ) -> tuple[int, BaseCallback]:
         if self.dataset is None or self._loaded_from is not self.dataset:
             self.set_dataset(self.dataset)
-        if self.env is None:
-            raise ValueError(f"env: pass it to {type(self).__name__}.load(..., env=...), or to set_env(), before learning.")
+        check_env_is_there(self)
         prepared = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
         assert self._demonstrations is not None
         fix_statistics(self._vec_normalize_env, self._demonstrations.observations)
         return prepared
 
+    @checked
     def learn(
         self: SelfOffline,
         total_timesteps: int,
@@ -223,7 +224,6 @@ class OfflineAlgorithm(BaseAlgorithm):
         :return: itself
         :raises DatasetError: if there is no dataset, or it does not fit
         """
-        check_integer("log_interval", log_interval, low=1)
         total_timesteps, callback = self._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )
