@@ -546,7 +546,9 @@ def test_drive_in_a_browser_and_sigterm_saves(tmp_path):
     [
         (["--serve", "here"], "--serve must be PORT or HOST:PORT"),
         (["--serve", "8000", "--device", "wheel"], "leave out --device"),
-        (["--serve", "203.0.113.1:8000"], "203.0.113.1:8000 cannot be served"),
+        (["--serve", "203.0.113.1:8000"], "203.0.113.1:8000 cannot be served .*: give an address of this machine"),
+        (["--serve", "nohost.invalid:8000"], "--serve: nohost.invalid:8000 cannot be served .*: give another address"),
+        (["--serve", "x" * 300 + ":8000"], "cannot be served .*: mend the name"),
     ],
 )
 def test_wrong_arguments_get_one_message(arguments, message, tmp_path, monkeypatch, capsys):
@@ -555,7 +557,7 @@ def test_wrong_arguments_get_one_message(arguments, message, tmp_path, monkeypat
     monkeypatch.setattr("sys.argv", ["sb3-chac", "drive", *arguments])
     with pytest.raises(SystemExit) as ended:
         main()
-    assert ended.value.code == 2 and message in capsys.readouterr().err
+    assert ended.value.code == 2 and re.search(message, capsys.readouterr().err)
 
 
 def test_an_encrypted_cockpit(tmp_path):

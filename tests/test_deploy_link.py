@@ -16,6 +16,7 @@ from stable_baselines3 import SAC
 import sb3_chac.envs
 from sb3_chac.__main__ import main as sb3_chac
 from sb3_chac.common.demonstrations import load_demonstrations
+from sb3_chac.deploy.address import bound_socket
 from sb3_chac.deploy.export import export
 from sb3_chac.deploy.fallback import RouteFallback
 from sb3_chac.deploy.gate import Fault, Limits, State
@@ -377,12 +378,16 @@ def test_the_command_runs_without_torch(file, policy, observation, tmp_path):
     "wrong, named",
     [
         (["--listen", "nonsense"], "--listen"),
+        (["--listen", "127.0.0.1:-1"], "--listen must be HOST:PORT"),
+        (["--listen", "nohost.invalid:1"], "--listen: no host 'nohost.invalid'"),
+        (["--listen", "203.0.113.1:5600"], "--listen: cannot listen at 203.0.113.1:5600"),
+        (["--vehicle", "nohost.invalid"], "--vehicle: no host 'nohost.invalid'"),
         (["--copies", "0"], "--copies"),
         (["--rate", "0"], "--rate"),
         (["--brake", "hold,fast"], "--brake"),
         (["--brake", "hold"], "brake"),
         (["--deadline", "nan"], "deadline"),
-        (["--log", "nowhere/log.jsonl"], "nowhere"),
+        (["--log", "nowhere/log.jsonl"], "--log nowhere"),
         (["--log", "there.jsonl"], "there already"),
     ],
 )
@@ -393,6 +398,21 @@ def test_mistakes_on_the_command_line(file, wrong, named, tmp_path, monkeypatch,
     with pytest.raises(SystemExit, match="2"):
         sb3_chac()
     assert named in (error := capsys.readouterr().err) and error.count("\n") == 1
+
+
+def test_a_port_in_use_is_named_with_the_remedy():
+    with bound_socket("--listen", ("127.0.0.1", 0)) as first:
+        address = first.getsockname()
+        with pytest.raises(NotDeployable, match=rf"^--listen: cannot listen at 127.0.0.1:{address[1]} .*choose another port"):
+            bound_socket("--listen", address)
+
+
+@pytest.mark.parametrize(
+    "address, named", [(("nohost.invalid", 5600), "no host"), (("127.0.0.1", 99999), "must be"), (("a", "b"), "must be")]
+)
+def test_the_address_of_a_policy_is_checked_before_the_drive(policy, address, named):
+    with pytest.raises(NotDeployable, match=f"^policy_address:? {named}"):
+        VehicleLink(policy.metadata, address)
 
 
 def test_a_log_of_something_else_is_refused(tmp_path):

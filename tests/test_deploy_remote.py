@@ -161,8 +161,11 @@ def test_noise_stays_in_the_space():
     env = LateLink(Cart(), noise=60.0, seed=0)
     seen = np.array([env.reset()[0] for _ in range(200)])
     assert seen.std() > 30 and all(env.observation_space.contains(row) for row in seen)
-    with pytest.raises(NotDeployable, match="noise"):
-        LateLink(Cart(), noise=float("nan"))
+    for noise in (float("nan"), "loud", 1j):
+        with pytest.raises(ValueError, match=r"^noise must be a finite number"):
+            LateLink(Cart(), noise=noise)
+    with pytest.raises(NotDeployable, match=r"^noise must be a finite number of at least 0"):
+        LateLink(Cart(), noise=-1.0)
     with pytest.raises(NotDeployable, match="loss"):
         LateLink(Cart(), loss=1.5)
 
@@ -173,9 +176,35 @@ def test_nobody_answers():
         address = f"127.0.0.1:{free.getsockname()[1]}"
         with pytest.raises(NotDeployable, match=rf"no vehicle answers at {address}.*sb3-chac vehicle"):
             RemoteVehicle(address, patience=0.2)
-    for wrong in ("nowhere", "127.0.0.1:0", "127.0.0.1:port"):
-        with pytest.raises(NotDeployable, match="HOST:PORT"):
-            RemoteVehicle(wrong)
+
+
+@pytest.mark.parametrize(
+    "wrong", ["nowhere", "127.0.0.1:0", "127.0.0.1:port", "127.0.0.1:65536", ":5700", "127.0.0.1:²", "a:" + "9" * 5000]
+)
+def test_an_address_that_is_none(wrong):
+    with pytest.raises(
+        NotDeployable, match=r"^address must be HOST:PORT with a port from 1 to 65535, such as 127.0.0.1:5600, got"
+    ):
+        RemoteVehicle(wrong)
+
+
+@pytest.mark.parametrize("host", ["nohost.invalid", "a..b", "x" * 300, "256.0.0.1", "no\0host", "::1"])
+def test_a_host_that_is_not_known(host):
+    with pytest.raises(NotDeployable, match=r"^address: no host .*: mend the name, or give its IPv4 address"):
+        RemoteVehicle(f"{host}:5700")
+
+
+@pytest.mark.parametrize("patience", [0, -1.0, float("nan"), "long", None, 1j])
+def test_patience_is_a_time(patience):
+    with pytest.raises(ValueError, match=r"^patience must be a finite number"):
+        RemoteVehicle("127.0.0.1:5700", patience)
+
+
+def test_a_request_that_fits_no_packet_names_the_options(vehicle):
+    env = RemoteVehicle(vehicle(Cart())[1])
+    with pytest.raises(NotDeployable, match=r"^options: the request has .* bytes, more than 65000"):
+        env.reset(options={"text": "x" * 70_000})
+    env.reset()
 
 
 def test_what_the_vehicle_refuses_is_said_and_changes_nothing(vehicle):
@@ -249,6 +278,10 @@ def test_the_command_is_a_vehicle(tmp_path):
     ("arguments", "named"),
     [
         (["--listen", "here"], "--listen"),
+        (["--listen", "127.0.0.1:65536"], "--listen must be HOST:PORT"),
+        (["--listen", "nohost.invalid:1"], "--listen: no host 'nohost.invalid'"),
+        (["--listen", "203.0.113.1:5700"], "--listen: cannot listen at 203.0.113.1:5700"),
+        (["--ready", "nowhere/address"], "--ready nowhere/address"),
         (["--loss", "2"], "loss"),
         (["--noise", "-1"], "noise"),
         (["--env", "Nowhere-v0"], "Nowhere-v0"),

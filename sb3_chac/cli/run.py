@@ -4,12 +4,12 @@ import argparse
 import gc
 import math
 import os
-import socket
 import time
 from contextlib import ExitStack
 from pathlib import Path
 
 from sb3_chac.cli.command import run_command
+from sb3_chac.deploy.address import bound_socket, parse_address, resolve
 from sb3_chac.deploy.gate import Limits
 from sb3_chac.deploy.log import DecisionLog
 from sb3_chac.deploy.metadata import NotDeployable
@@ -71,10 +71,11 @@ def run(args: argparse.Namespace) -> None:
 
     :param args: see ``make_parser``
     :raises NotDeployable: for arguments that do not fit
-    :raises OSError: if a file or the address cannot be used
+    :raises OSError: if a file cannot be used
     """
     start = time.perf_counter()
-    host, port = parse_address(args.listen)
+    address = parse_address("--listen", args.listen)
+    allowed = None if args.vehicle is None else resolve("--vehicle", args.vehicle)
     for option, low in [("copies", 1), ("steps", 1)]:
         value = getattr(args, option)
         if value is not None and value < low:
@@ -88,8 +89,7 @@ def run(args: argparse.Namespace) -> None:
         raise NotDeployable(f"--rate must be a finite number above 0, got {rate}.")
     runtime = Runtime(policy, limits)
     with ExitStack() as stack:
-        sock = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
-        sock.bind((host, port))
+        sock = stack.enter_context(bound_socket("--listen", address))
         sock.setblocking(False)
         log = None
         if args.log is not None:
@@ -97,14 +97,15 @@ def run(args: argparse.Namespace) -> None:
                 log = stack.enter_context(DecisionLog(args.log, policy.metadata))
             except FileExistsError as error:
                 raise NotDeployable(f"--log {args.log}: the file is there already, choose another name.") from error
+            except OSError as error:
+                raise NotDeployable(f"--log {args.log}: cannot be written ({error.strerror}), choose another.") from error
         if args.realtime:
             ask_for_priority()
-        allowed = None if args.vehicle is None else socket.gethostbyname(args.vehicle)
         server = PolicyServer(runtime, sock, 1 / rate, args.copies, allowed, log)
-        address = ":".join(map(str, sock.getsockname()))
+        own = ":".join(map(str, sock.getsockname()))
         metadata = policy.metadata
         print(f"{args.policy}: {metadata.algorithm}, {len(metadata.layout)} described parts of an observation", flush=True)
-        print(f"Ready on {address} after {time.perf_counter() - start:.2f} s; waiting for a vehicle", flush=True)
+        print(f"Ready on {own} after {time.perf_counter() - start:.2f} s; waiting for a vehicle", flush=True)
         # What there is now stays: no pause of the garbage collector while the vehicle drives
         gc.collect()
         gc.freeze()
@@ -114,19 +115,6 @@ def run(args: argparse.Namespace) -> None:
         finally:
             gc.enable()
             print(server.summary(), flush=True)
-
-
-def parse_address(text: str) -> tuple[str, int]:
-    """
-    Parse an address.
-
-    :param text: HOST:PORT
-    :raises NotDeployable: for anything else
-    """
-    host, _, port = text.rpartition(":")
-    if not host or not port.isdigit() or int(port) > 65535:
-        raise NotDeployable(f"--listen must be HOST:PORT, such as 0.0.0.0:5600, got {text!r}.")
-    return host, int(port)
 
 
 def parse_brake(text: str) -> list[float | None]:

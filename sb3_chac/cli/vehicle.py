@@ -1,15 +1,15 @@
 """``python -m sb3_chac vehicle``: an environment as a vehicle at the end of a network link, for a learner elsewhere."""
 
 import argparse
-import socket
 import time
 from pathlib import Path
 
 import gymnasium as gym
 
 import sb3_chac.envs  # noqa: F401  (registers our environments)
-from sb3_chac.cli.arguments import parse_env_kwargs
+from sb3_chac.cli.arguments import check_output, parse_env_kwargs
 from sb3_chac.cli.command import run_command
+from sb3_chac.deploy.address import bound_socket, parse_address
 from sb3_chac.deploy.metadata import NotDeployable
 from sb3_chac.deploy.remote import LateLink, VehicleServer
 from sb3_chac.evaluation.episodes import NotEvaluable, make_env
@@ -63,11 +63,10 @@ def run(args: argparse.Namespace) -> None:
 
     :param args: see ``make_parser``
     :raises ValueError: for arguments that do not fit
-    :raises OSError: if the address cannot be used
+    :raises OSError: if the file of ``--ready`` cannot be written
     """
-    host, _, port = args.listen.rpartition(":")
-    if not host or not port.isdigit() or int(port) > 65535:
-        raise NotDeployable(f"--listen must be HOST:PORT, such as 0.0.0.0:5700, got {args.listen!r}.")
+    address = parse_address("--listen", args.listen)
+    check_output("--ready", args.ready)
     for option, low in (("steps", 1), ("seed", 0), ("budget", 1)):
         value = getattr(args, option)
         if value is not None and value < low:
@@ -76,13 +75,12 @@ def run(args: argparse.Namespace) -> None:
     try:
         env = InterventionWrapper(env, expert=args.expert, rule=args.rule, budget=args.budget, armed=True)
         env = LateLink(env, args.latency, args.jitter, args.loss, args.noise, args.seed)
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
-            sock.bind((host, int(port)))
+        with bound_socket("--listen", address) as sock:
             server = VehicleServer(env, sock)
-            address = ":".join(map(str, sock.getsockname()))
-            print(f"{args.env} waits for a learner at {address}", flush=True)
+            own = ":".join(map(str, sock.getsockname()))
+            print(f"{args.env} waits for a learner at {own}", flush=True)
             if args.ready is not None:
-                args.ready.write_text(address)
+                args.ready.write_text(own)
             start = time.monotonic()
             try:
                 server.serve(args.steps)

@@ -29,6 +29,7 @@ from sb3_chac.cockpit.address import Address
 from sb3_chac.cockpit.devices import Clock
 from sb3_chac.cockpit.devices.browser import BadMessage, Browser, Held, Wish, parse
 from sb3_chac.cockpit.session import Session, asks_for_help, indicators, who_drives
+from sb3_chac.deploy.address import remedy
 
 STATIC = Path(__file__).parent / "static"
 FILES = {"/": "index.html", "/cockpit.js": "cockpit.js", "/cockpit.css": "cockpit.css"}
@@ -100,10 +101,13 @@ class Server:
             listener = await loop.create_server(
                 lambda: access.admit(http), access.address.host, access.address.port, backlog=MOST_CONNECTIONS, ssl=access.tls
             )
-        except OSError as error:
+        except (OSError, UnicodeError) as error:  # the latter for what can be no name
             await runner.cleanup()
-            reason = error.strerror or str(error)
-            raise OSError(f"--serve: {access.address.host}:{access.address.port} cannot be served: {reason}.") from error
+            host, port = access.address
+            reason, help_ = str(error), "mend the name"
+            if isinstance(error, OSError):
+                reason, help_ = error.strerror or reason, remedy(error)
+            raise OSError(f"--serve: {host:.80}:{port} cannot be served ({reason}): {help_}.") from error
         access.address = Address(access.address.host, listener.sockets[0].getsockname()[1])
         tasks = [asyncio.create_task(self._publish()), asyncio.create_task(access.sweep(http))]
         try:

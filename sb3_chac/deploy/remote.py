@@ -1,7 +1,6 @@
 """A vehicle in a process of its own, or on another machine, that a learner trains over UDP: its two ends."""
 
 import json
-import math
 import select
 import socket
 import struct
@@ -13,6 +12,8 @@ import numpy as np
 from gymnasium import spaces
 
 from sb3_chac.common import contract
+from sb3_chac.common.arguments import checked
+from sb3_chac.deploy.address import parse_address, resolve
 from sb3_chac.deploy.link import Channel
 from sb3_chac.deploy.metadata import NotDeployable
 
@@ -39,14 +40,15 @@ class LateLink(gym.Wrapper):
     :param loss: share of the actions that are lost
     :param noise: standard deviation of what is added to observations, in their units; they stay in their space
     :param seed: of the link
-    :raises NotDeployable: for values out of their range
+    :raises ValueError: for values that are none, or out of their range
     """
 
+    @checked
     def __init__(
         self, env: gym.Env, latency: float = 0.0, jitter: float = 0.0, loss: float = 0.0, noise: float = 0.0, seed: int = 0
     ) -> None:
         super().__init__(env)
-        if not (math.isfinite(noise) and noise >= 0):
+        if noise < 0:
             raise NotDeployable(f"noise must be a finite number of at least 0, got {noise!r}.")
         self.rng = np.random.default_rng(seed)
         self.period = 1 / float(env.metadata.get("render_fps") or 10)
@@ -176,20 +178,25 @@ class RemoteVehicle(gym.Env):
 
     :param address: HOST:PORT of the vehicle
     :param patience: [s] without an answer after which the vehicle is given up
-    :raises NotDeployable: for an address that is none, or if no vehicle answers
+    :raises ValueError: for arguments that are none
+    :raises NotDeployable: for an address that cannot be used, or if no vehicle answers
     """
 
     metadata = {"render_modes": []}  # noqa: RUF012
 
+    @checked
     def __init__(self, address: str = "127.0.0.1:5700", patience: float = PATIENCE) -> None:
-        host, _, port = str(address).rpartition(":")
-        if not host or not port.isdigit() or not 0 < int(port) < 65536:
-            raise NotDeployable(f"address must be HOST:PORT, such as 127.0.0.1:5700, got {address!r}.")
-        if not (math.isfinite(patience) and patience > 0):
+        host, port = parse_address("address", address, low=1)
+        if patience <= 0:
             raise NotDeployable(f"patience must be a finite number of seconds above 0, got {patience!r}.")
-        self.address, self.patience = (host, int(port)), patience
+        self.address, self.patience = (host, port), patience
+        place = resolve("address", host), port
         self.sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self.sock.connect(self.address)
+        try:
+            self.sock.connect(place)
+        except OSError as error:
+            self.sock.close()
+            raise NotDeployable(f"address: {address} cannot be reached ({error.strerror}): give another.") from error
         self.sock.setblocking(False)
         self.session, self.number = np.random.default_rng().bytes(16), 0
         try:
@@ -219,10 +226,14 @@ class RemoteVehicle(gym.Env):
         """
         Send a request until it is answered.
 
-        :raises NotDeployable: if nobody answers, or the vehicle says that it cannot
+        :raises NotDeployable: if nobody answers, the vehicle says that it cannot, or the request is too long for a packet
         """
         self.number += 1
         request = pack(self.session, self.number, kind, meta, body)
+        if len(request) > LARGEST:
+            raise NotDeployable(
+                f"options: the request has {len(request)} bytes, more than {LARGEST} in a packet: shorten them."
+            )
         end = time.monotonic() + self.patience
         while time.monotonic() < end:
             try:
@@ -234,7 +245,7 @@ class RemoteVehicle(gym.Env):
                     if "error" in answer:
                         raise NotDeployable(f"the vehicle at {self.address[0]}:{self.address[1]} refuses: {answer['error']}")
                     return answer, rest
-            except ConnectionRefusedError:  # nobody listens there yet
+            except OSError:  # nobody listens there yet, or there is no way there at the moment
                 time.sleep(RESEND)
             except ValueError as error:
                 if isinstance(error, NotDeployable):

@@ -28,6 +28,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from sb3_chac.deploy.address import parse_address, resolve
 from sb3_chac.deploy.fallback import RouteFallback
 from sb3_chac.deploy.gate import Decision, Fault, Gate, Given, Limits, State
 from sb3_chac.deploy.metadata import Input, Metadata, NotDeployable
@@ -235,6 +236,7 @@ class VehicleLink:
     :param copies: how many times each packet is sent
     :param fallback: steers during BRAKE, by default along the route, if the observation has one
     :param sock: a bound, non-blocking UDP socket, made if None
+    :raises NotDeployable: without ``sock``, for an address that is none, or of no host
     """
 
     def __init__(
@@ -250,6 +252,8 @@ class VehicleLink:
         self.gate = Gate(limits or Limits.of(metadata))
         self.fallback = fallback or RouteFallback.of(metadata)
         if sock is None:
+            host, port = parse_address("policy_address", ":".join(map(str, policy_address)), low=1)
+            self.address = resolve("policy_address", host), port
             sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
             sock.bind(("", 0))
             sock.setblocking(False)
