@@ -166,7 +166,9 @@ def test_nan_in_a_dict_observation_names_the_key_and_the_environment():
         model.learn(20)
 
 
-@pytest.mark.parametrize("action", [[np.nan, 0], [0, np.inf], [0], [0, 0, 0], "left", None])
+@pytest.mark.parametrize(
+    "action", [[np.nan, 0], [0, np.inf], [0], [0, 0, 0], "left", None, [0, 1j], np.array([0, 1j]), ["0", "1"]]
+)
 def test_actions_that_are_none_do_not_move_the_car(action):
     env = SafeDriveEnv(horizon=5)
     env.reset(seed=0)

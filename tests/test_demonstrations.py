@@ -348,6 +348,8 @@ def test_an_environment_that_fails_leaves_nothing(datasets):
         record("toy/fails-v0", "scripted", Fails, 30, scenarios="3:6")
     with pytest.raises(ValueError, match=r"episode 0 of .* has NaN or infinite values: mend the environment"):
         record("toy/nan-v0", "scripted", TOY, 30, env_kwargs={"reward": float("nan")})
+    with pytest.raises(ValueError, match="policy must return finite numbers"):
+        record("toy/complex-v0", lambda observation: np.array([0.5j]), TOY, 30)
     assert not datasets.exists()
 
 

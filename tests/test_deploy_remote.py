@@ -347,8 +347,9 @@ def test_what_a_vehicle_reports_arrives(vehicle, info, learner):
     env.close()
 
 
-def test_a_cost_that_is_no_number_is_not_dropped(vehicle):
-    _, address = vehicle(Odd({"cost": float("nan")}))
+@pytest.mark.parametrize("cost", [float("nan"), 1j, np.array([1j]), "0.5", [0.1, 0.2]], ids=repr)
+def test_a_cost_that_is_no_number_is_not_dropped(vehicle, cost):
+    _, address = vehicle(Odd({"cost": cost}))
     model = DPVP("MlpPolicy", RemoteVehicle(address), learning_starts=5, policy_kwargs=dict(net_arch=[8]), seed=0)
     with pytest.raises(ValueError, match=r"info\['cost'\]"):
         model.learn(10)

@@ -21,6 +21,7 @@ from sb3_chac import DSAC
 from sb3_chac.cli.demos import main as demos
 from sb3_chac.cli.evaluate import main as command
 from sb3_chac.common.demonstrations import load_demonstrations
+from sb3_chac.evaluation.episodes import NotEvaluable
 from sb3_chac.evaluation.evaluation import evaluate, scenario_list
 from sb3_chac.evaluation.models import find_algorithm
 
@@ -303,3 +304,15 @@ def test_errors_of_the_function(sac):
         evaluate(sac, TOY, jobs=0)
     with pytest.raises(ValueError, match=r"return of episode 1 of .* is nan"):
         evaluate(sac, TOY, [1], env_kwargs={"reward": float("nan")})
+    for value in (1j, np.complex128(1j), "0.5", None):
+        with pytest.raises(NotEvaluable, match=r"return of episode 1 of .* is nan: mend the environment"):
+            evaluate(sac, TOY, [1], env_kwargs={"reward": value})
+
+
+@pytest.mark.parametrize("action", [None, "0", ["0"], [1j], np.array([1j]), [0.0, 0.0], [np.nan]])
+def test_a_policy_that_returns_no_action_is_refused(action):
+    with pytest.raises(NotEvaluable, match=r"^policy must return finite numbers of shape \(1,\), returned"):
+        evaluate(lambda _: action, TOY, [1])
+    if np.size(action) == 1:
+        with pytest.raises(NotEvaluable, match=r"^policy must return a whole number, the space being Discrete\(2\), returned"):
+            evaluate(lambda _: action, "toy_env:BlindDrive-v0", episodes=1)

@@ -145,7 +145,7 @@ def test_a_rule_that_raises():
 def test_rules_must_answer_true_or_false():
     with pytest.raises(RuleError, match=r"rule .* must return True or False, got None"):
         drive(armed(lambda *args: None), 1)
-    with pytest.raises(RuleError, match="NaN"):
+    with pytest.raises(RuleError, match="time_to_trouble returned nan"):
         drive(armed(risky([math.nan])), 1)
 
 
@@ -202,7 +202,14 @@ def raises(observation):
         (lambda observation: np.array([np.inf, 0.0]), "NaN or infinite"),
         (lambda observation: np.zeros(3), r"shape \(3,\).* \(2,\)"),
         (lambda observation: 0.0, r"shape \(\)"),
-        (lambda observation: None, r"shape \(\)"),
+        (lambda observation: None, "returned no real numbers, but None"),
+        (lambda observation: "left", "returned no real numbers, but 'left'"),
+        (lambda observation: ["0.1", "0.2"], r"returned no real numbers, but \['0.1', '0.2'\]"),
+        (lambda observation: [0.1, None], "returned no real numbers"),
+        (lambda observation: [0.1, 1j], "returned no real numbers"),
+        (lambda observation: np.array([0.1, 1j]), "returned no real numbers"),
+        (lambda observation: [[0.1], [0.2, 0.3]], "returned no real numbers"),
+        (lambda observation: {}, r"returned no real numbers, but \{\}"),
         (lambda observation: np.array([1.00001, 0.0]), "out of bounds"),
         (lambda observation: np.array([0.0, -3.0]), "out of bounds"),
     ],
@@ -227,6 +234,13 @@ def test_bad_experts_never_reach_the_environment(expert, message):
     calls.clear()
     env.reset()
     assert drive(env, 1, "takeover_start") == [True]
+
+
+@pytest.mark.parametrize("time", [np.nan, None, "2.0", 1j, np.complex128(2), [1.0, 2.0]], ids=repr)
+def test_a_prediction_of_trouble_that_is_no_time(time):
+    rule = RiskRule(lambda observation, action: time)
+    with pytest.raises(ValueError, match=r"^time_to_trouble returned .*: return the time in seconds"):
+        rule(None, NOVICE, NOVICE, False)
 
 
 def test_an_expert_whose_reset_fails():

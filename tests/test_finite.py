@@ -10,6 +10,7 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_chac.common.checkpoints import ResumableCheckpoint
+from sb3_chac.common.checks import check_finite
 from sb3_chac.evaluation.episodes import NotEvaluable
 from sb3_chac.evaluation.models import find_normalization
 
@@ -100,6 +101,37 @@ def test_steps_that_are_not_finite_are_refused(name, source, value):
         model.learn(60)
     assert model.num_timesteps <= BREAKS_AT
     assert_finite(model)
+
+
+NO_NUMBERS = {"complex": 0.5j, "NumPy's complex": np.complex128(0.5 + 1j), "array of complex": np.array([1j]), "text": "0.5"}
+NO_NUMBERS |= {"two": [0.1, 0.2], "dict": {}}
+
+
+@pytest.mark.parametrize("value", NO_NUMBERS.values(), ids=NO_NUMBERS)
+@pytest.mark.parametrize("name", [name for name in ALL if name not in OFFLINE])
+def test_a_cost_that_is_no_real_number_is_refused(name, value):
+    kwargs = {"dataset": float64_demonstrations()} if name == "GAIL" else {}
+    model = make_any(name, Broken("cost", value), **kwargs)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", np.exceptions.ComplexWarning)
+        with pytest.raises(ValueError, match=SOURCES["cost"] + " must be a finite number at every step, got"):
+            model.learn(60)
+    assert_finite(model)
+
+
+@pytest.mark.parametrize("source", ["intervene_action", "applied_action"])
+@pytest.mark.parametrize("name", GUIDED)
+def test_a_reported_action_that_is_complex_is_refused(name, source):
+    model = make_any(name, Broken(source, 1j))
+    with pytest.raises(ValueError, match=OF_TAKEOVERS[source] + ", the human's action, must be finite numbers"):
+        model.learn(60)
+    assert_finite(model)
+
+
+@pytest.mark.parametrize("values", [np.array([1j]), np.array(["1.0"]), np.array([None])], ids=["complex", "text", "object"])
+def test_what_is_no_real_number_is_named_with_its_type(values):
+    with pytest.raises(ValueError, match=rf"reward of environment 0 is no real number \({values.dtype}\) at step 3"):
+        check_finite("reward", values, 3)
 
 
 def float64_demonstrations(**columns):

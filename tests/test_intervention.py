@@ -215,7 +215,10 @@ def test_the_budget_is_never_exceeded(decisions, events, budget, length):
 # Actions, spaces, other libraries
 
 
-@pytest.mark.parametrize("action", [np.array([np.nan, 0.0]), np.array([0.0, np.inf]), np.zeros(3), 0.5, "left", [[1], [2, 3]]])
+NO_ACTIONS = ["left", None, [0.1, None], ["0.1", "0.2"], [0.1, 1j], np.array([0.1, 1j]), [[1], [2, 3]]]
+
+
+@pytest.mark.parametrize("action", [np.array([np.nan, 0.0]), np.array([0.0, np.inf]), np.zeros(3), 0.5, *NO_ACTIONS])
 def test_bad_novice_actions(action):
     env = armed(Script(bits("11")))
     drive(env, 1)

@@ -20,7 +20,6 @@ from sb3_chac.datasets.recording import WatchedEnv, record
 from sb3_chac.datasets.replay import Replay
 from sb3_chac.datasets.writer import SETTINGS
 from sb3_chac.deploy.dataset import dataset_of
-from sb3_chac.deploy.metadata import NotDeployable
 from sb3_chac.evaluation import pictures
 from sb3_chac.evaluation.episodes import NotEvaluable, make_env
 from sb3_chac.evaluation.evaluation import saved_model
@@ -106,7 +105,8 @@ def main(arguments: list[str]) -> None:
 
     :param arguments: of the command line, after ``demos``
     """
-    run_command(make_parser(), arguments, run, NotEvaluable, DatasetError, NotDeployable)
+    # ValueErrors are ours and, of what a recorded environment tells, its author's
+    run_command(make_parser(), arguments, run, ValueError)
 
 
 def run(args: argparse.Namespace) -> None:

@@ -7,6 +7,7 @@ import numpy as np
 
 from sb3_chac.cockpit.recording import CrashSafeRecorder
 from sb3_chac.cockpit.session import Session, lost_message
+from sb3_chac.common.checks import number_in
 from sb3_chac.common.contract import TakeoverDisplay
 from sb3_chac.human.intervention import ControlState, InterventionWrapper
 
@@ -69,7 +70,7 @@ class Cockpit(gym.Wrapper):
         self.steps += 1
         self.recorder.add(proposed, observation, float(reward), terminated, truncated, info)
         drive.count(
-            cost=drive.totals.cost + info.get("cost", 0.0),
+            cost=drive.totals.cost + (number_in(info, "cost", 0) or 0.0),
             collisions=drive.totals.collisions + self._has_collided(info),
         )
         self._show(

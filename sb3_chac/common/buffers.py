@@ -12,7 +12,7 @@ from stable_baselines3.common.type_aliases import TensorDict
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_chac.common.arguments import checked
-from sb3_chac.common.checks import check_integer, check_range
+from sb3_chac.common.checks import check_integer, check_range, number_in
 from sb3_chac.common.contract import NOVICE_ACTION, TAKEOVER, TAKEOVER_START
 
 Observation = np.ndarray | dict[str, np.ndarray]
@@ -230,7 +230,7 @@ class DualReplayBuffer(ReplayBuffer):
                 "done": done[idx] and not is_timeout,
                 "takeover": bool(info.get(TAKEOVER, False)),
                 "takeover_start": bool(info.get(TAKEOVER_START, False)),
-                "cost": float(info.get("cost") or 0.0),  # None: not measured
+                "cost": number_in(info, "cost", idx) or 0.0,  # None: not measured
                 "takeover_follows": 0.0,
             }
             if row["takeover_start"]:

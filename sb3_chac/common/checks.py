@@ -61,11 +61,8 @@ def check_driving_action(action: Any) -> None:
     :param action: [steering, acceleration], handed to an environment
     :raises ValueError: unless it is two finite numbers
     """
-    try:
-        numbers = np.asarray(action, dtype=float)
-    except (TypeError, ValueError):
-        numbers = np.array(np.nan)
-    if numbers.shape != (2,) or not np.isfinite(numbers).all():
+    numbers = real_numbers(action)
+    if numbers is None or numbers.shape != (2,) or not np.isfinite(numbers).all():
         raise ValueError(
             f"action must be two finite numbers, [steering, acceleration], got {action!r}. The environment did not make a "
             "step: look for the NaN or the shape where the action comes from."
@@ -112,15 +109,43 @@ def check_learning_rate(name: str, value: float | Callable[[float], float]) -> N
             raise ValueError(f"{error} Pass a rate such as 3e-4, or a schedule that stays positive.") from None
 
 
+REAL = "biuf"  # kinds of dtypes: truth values, integers, floating point numbers
+
+
+def real_numbers(values: Any) -> np.ndarray | None:
+    """
+    Read real numbers of unknown origin. NumPy would make numbers of text, and drop the imaginary part of complex ones.
+
+    :param values: a number, an array or nested lists
+    :return: a copy in float64, None for anything else, such as text, None, complex numbers and rows of different lengths
+    """
+    try:
+        array = np.asarray(values)
+    except (TypeError, ValueError):
+        return None
+    return array.astype(np.float64) if array.dtype.kind in REAL else None
+
+
+def number_or_nan(value: Any) -> float:
+    """
+    Read a real number of unknown origin.
+
+    :param value: a number, or an array that holds one
+    :return: the number, NaN if it is none
+    """
+    numbers = real_numbers(value)
+    return math.nan if numbers is None or numbers.size != 1 else numbers.item()
+
+
 def is_finite(values: Any) -> bool:
     """
     Tell whether numbers are finite.
 
     :param values: a number or an array of any kind
-    :return: whether none is NaN, infinite, or too large for the 32 bits that numbers are stored in
+    :return: whether all are real, and none is NaN, infinite, or too large for the 32 bits that numbers are stored in
     """
     array = np.asarray(values)
-    return not np.issubdtype(array.dtype, np.floating) or bool((np.abs(array) <= FLOAT32_MAX).all())
+    return array.dtype.kind in REAL and (array.dtype.kind != "f" or bool((np.abs(array) <= FLOAT32_MAX).all()))
 
 
 def number_in(info: dict[str, Any], key: str, env_idx: int) -> float | None:
@@ -134,10 +159,7 @@ def number_in(info: dict[str, Any], key: str, env_idx: int) -> float | None:
     value = info.get(key)
     if value is None:
         return None
-    try:
-        number = float(np.asarray(value).item())
-    except (TypeError, ValueError):
-        number = math.nan
+    number = number_or_nan(value)
     if not is_finite(number):
         raise ValueError(
             f"info[{key!r}] of environment {env_idx} must be a finite number at every step, got {value!r}: mend the "
@@ -182,8 +204,9 @@ def check_finite(name: str, values: np.ndarray | dict[str, np.ndarray], step: in
             continue
         if env_idx is None:
             env_idx = next(idx for idx, row in enumerate(array) if not is_finite(row))
+        problem = "NaN or infinite" if array.dtype.kind in REAL else f"no real number ({array.dtype})"
         raise ValueError(
-            f"{name}{'' if key is None else f' {key!r}'} of environment {env_idx} is NaN or infinite at step {step}: "
+            f"{name}{'' if key is None else f' {key!r}'} of environment {env_idx} is {problem} at step {step}: "
             "mend the environment (stable_baselines3.common.vec_env.VecCheckNan finds the origin). "
             "Nothing of this step was stored; the model and its replay buffer can still be saved."
         )

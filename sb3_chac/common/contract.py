@@ -11,7 +11,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from sb3_chac.common.checks import UnsupportedActionSpace, is_finite
+from sb3_chac.common.checks import UnsupportedActionSpace, is_finite, real_numbers
 
 if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecEnv
@@ -63,11 +63,8 @@ def read_report(info: dict[str, Any], action_space: spaces.Space, env_idx: int =
             f"as info[{APPLIED_ACTION!r}] or info[{REPORTED_ACTIONS[0]!r}], in the units of the action space."
         )
     key, values = found
-    try:
-        action = np.array(values, dtype=np.float64)
-    except (TypeError, ValueError):
-        action = np.array(np.nan)
-    if not is_finite(action) or action.size != np.prod(action_space.shape or (1,)):
+    action = real_numbers(values)
+    if action is None or not is_finite(action) or action.size != np.prod(action_space.shape or (1,)):
         raise ValueError(
             f"info[{key!r}] of environment {env_idx}, the human's action, must be finite numbers of shape "
             f"{action_space.shape}, got {values!r}: mend the environment. Nothing of this step was stored."

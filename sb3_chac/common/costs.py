@@ -1,6 +1,5 @@
 """The count of safety costs: ``info["cost"]`` of the training environments, in one place for all algorithms."""
 
-import math
 from collections import deque
 from collections.abc import Sequence
 from typing import Any
@@ -9,7 +8,7 @@ import numpy as np
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.utils import safe_mean
 
-from sb3_chac.common.checks import is_finite, number_in
+from sb3_chac.common.checks import is_finite, number_in, number_or_nan
 
 TOTAL, EPISODE_MEAN = "safety/safety_cost", "rollout/ep_cost_mean"  # of the logger
 
@@ -49,10 +48,7 @@ def step_costs(infos: list[dict[str, Any]]) -> np.ndarray:
     """
     costs = np.zeros(len(infos))
     for idx, info in enumerate(infos):
-        try:
-            costs[idx] = float(info["cost"])
-        except (KeyError, TypeError, ValueError):
-            costs[idx] = math.nan
+        costs[idx] = number_or_nan(info.get("cost"))
         if not is_finite(costs[idx]):
             raise ValueError(
                 f"info['cost'] of environment {idx} must be a finite number at every step, got {info.get('cost', 'none')!r}: "

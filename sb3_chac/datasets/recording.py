@@ -22,7 +22,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.common.vec_env.base_vec_env import CloudpickleWrapper
 from tqdm import tqdm
 
-from sb3_chac.common.checks import UnsupportedActionSpace, check_integer, number_in
+from sb3_chac.common.checks import UnsupportedActionSpace, check_integer, number_in, number_or_nan
 from sb3_chac.common.contract import (
     NOVICE_ACTION,
     TAKEOVER,
@@ -175,12 +175,12 @@ class Recorder(Runner):
         terminations: list[bool] = []
         truncations: list[bool] = []
         while not rewards or not (terminations[-1] or truncations[-1]):
-            action = self._in_space(self.driver(observation))
+            action = self._in_space(self._act(observation))
             proposed = copy.deepcopy(action)  # the environment may change what it is given
             observation, reward, terminated, truncated, info = self.env.step(action)
             observations.append(np.array(observation))
             actions.append(self._executed(proposed, info))
-            rewards.append(float(reward))
+            rewards.append(number_or_nan(reward))
             terminations.append(bool(terminated))
             truncations.append(bool(truncated))
             proposals.append(proposed)

@@ -13,6 +13,7 @@ from gymnasium import spaces
 
 from sb3_chac.common import contract
 from sb3_chac.common.arguments import checked
+from sb3_chac.common.checks import number_or_nan
 from sb3_chac.deploy.address import parse_address, resolve
 from sb3_chac.deploy.link import Channel
 from sb3_chac.deploy.metadata import NotDeployable
@@ -314,7 +315,9 @@ def reported(info: dict[str, Any]) -> dict[str, Any]:
     """
     found: dict[str, Any] = {}
     for key, value in info.items():
-        if isinstance(value, np.generic) or (isinstance(value, np.ndarray) and value.size == 1):
+        if key in ("cost", "takeover_cost") and value is not None:
+            value = number_or_nan(value)  # what is none is told, too: the learner refuses it
+        elif isinstance(value, np.generic) or (isinstance(value, np.ndarray) and value.size == 1):
             value = value.item()
         elif isinstance(value, np.ndarray) and key in (*contract.REPORTED_ACTIONS, *contract.FLAGS):
             value = value.tolist()

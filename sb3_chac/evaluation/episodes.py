@@ -17,7 +17,7 @@ from stable_baselines3.common.utils import FloatSchedule, check_for_correct_spac
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 import sb3_chac.envs  # noqa: F401  (registers our environments)
-from sb3_chac.common.checks import is_finite
+from sb3_chac.common.checks import is_finite, number_or_nan, real_numbers
 from sb3_chac.envs import REHEARSALS
 from sb3_chac.envs.driving.corridors import corridors_remedy
 from sb3_chac.human.experts import ModelExpert, make_expert
@@ -234,19 +234,21 @@ class Runner:
         """
         Ask the driver for an action.
 
-        :raises NotEvaluable: if an expert fails, or returns what is no action
+        :raises NotEvaluable: if an expert fails, or anybody returns what is no action
         """
-        if not isinstance(self.task.policy, str):
-            return self.driver(observation)
+        policy, space = self.task.policy, self.env.action_space
+        name = f"expert {policy!r}" if isinstance(policy, str) else "policy"
         try:
             action = self.driver(observation)
         except Exception as error:
-            raise NotEvaluable(f"expert {self.task.policy!r} raised {type(error).__name__}: {error}") from error
-        space = self.env.action_space
-        if isinstance(space, spaces.Box) and (np.shape(action) != space.shape or not is_finite(action)):
-            raise NotEvaluable(
-                f"expert {self.task.policy!r} must return finite numbers of shape {space.shape}, returned {action!r}."
-            )
+            if not isinstance(policy, str):
+                raise
+            raise NotEvaluable(f"{name} raised {type(error).__name__}: {error}") from error
+        numbers = real_numbers(action)
+        if isinstance(space, spaces.Box) and (numbers is None or numbers.shape != space.shape or not is_finite(numbers)):
+            raise NotEvaluable(f"{name} must return finite numbers of shape {space.shape}, returned {action!r}.")
+        if isinstance(space, spaces.Discrete) and (numbers is None or numbers.size != 1 or numbers.item() % 1):
+            raise NotEvaluable(f"{name} must return a whole number, the space being {space}, returned {action!r}.")
         return action
 
     def seed(self, number: int) -> int:
@@ -277,8 +279,8 @@ class Runner:
         :param number: scenario, or episode if the task has no scenarios
         :param on_step: called after the reset and after each step
         :return: record and driven path, see ``Evaluation``
-        :raises NotEvaluable: if the path is to be recorded, but the environment has no position
-        :raises ValueError: for a reward, cost or route completion that is not finite
+        :raises NotEvaluable: if the path is to be recorded, but the environment has no position; and for a reward, cost or
+            route completion that is no finite number
         """
         observation = self.reset(number)
         info: dict[str, Any] = {}
@@ -289,8 +291,8 @@ class Runner:
             action = self._act(observation)
             actions.append(copy.deepcopy(action))  # the environment may change what it is given
             observation, reward, terminated, truncated, info = self.env.step(action)
-            rewards.append(float(reward))
-            costs.append(float(info.get("cost", 0.0)))
+            rewards.append(number_or_nan(reward))
+            costs.append(0.0 if info.get("cost") is None else number_or_nan(info["cost"]))
             positions.append(self._position())
             on_step()
         record = {
@@ -298,15 +300,17 @@ class Runner:
             "seed": self.seed(number),
             "return": math.fsum(rewards),
             "steps": len(rewards) - 1,
-            **({"cost": math.fsum(costs)} if "cost" in info else {}),
+            **({"cost": math.fsum(costs)} if info.get("cost") is not None else {}),
             **({"success": bool(info["is_success"])} if "is_success" in info else {}),
-            **({"route_completion": float(info["route_completion"])} if "route_completion" in info else {}),
+            **({"route_completion": number_or_nan(info["route_completion"])} if "route_completion" in info else {}),
             "terminated": bool(terminated),
             "truncated": bool(truncated),
         }
         for key in ("return", "cost", "route_completion"):
             if not math.isfinite(record.get(key, 0.0)):
-                raise ValueError(f"{key} of episode {number} of {self.env.unwrapped} is {record[key]}: mend the environment.")
+                raise NotEvaluable(
+                    f"{key} of episode {number} of {self.env.unwrapped} is {record[key]}: mend the environment."
+                )
         record |= {key: value for key, value in _scalars(info).items() if key not in {*record, "is_success"}}
         if not self.task.record_paths:
             return record, None

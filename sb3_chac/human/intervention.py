@@ -12,7 +12,7 @@ from gymnasium.utils import RecordConstructorArgs
 
 from sb3_chac.common import contract
 from sb3_chac.common.arguments import checked
-from sb3_chac.common.checks import check_action_space, check_integer, check_range
+from sb3_chac.common.checks import check_action_space, check_integer, check_range, real_numbers
 from sb3_chac.human.experts import check_expert
 from sb3_chac.human.rules import check_rule
 from sb3_chac.human.supervisor import Supervisor
@@ -371,11 +371,8 @@ class InterventionWrapper(contract.TakeoverWrapper, RecordConstructorArgs):
     def _checked_novice_action(self, action: Any) -> np.ndarray:
         if self._observation is None:
             raise ResetNeeded("Call reset() before step(): no episode is under way (none started, it ended, or it failed).")
-        try:
-            array = np.array(action, dtype=np.float64)
-        except (TypeError, ValueError):
-            array = np.array(np.nan)
-        if not np.isfinite(array).all() or array.shape != self._box.shape:
+        array = real_numbers(action)
+        if array is None or not np.isfinite(array).all() or array.shape != self._box.shape:
             raise ValueError(
                 f"action must be finite numbers of shape {self._box.shape}, got {action!r}. The environment did not "
                 "make a step: look for the NaN or the shape where the action comes from."

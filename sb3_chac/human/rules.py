@@ -10,7 +10,7 @@ import numpy as np
 from gymnasium import spaces
 
 from sb3_chac.common.arguments import checked
-from sb3_chac.common.checks import check_action_space, check_integer, check_range
+from sb3_chac.common.checks import check_action_space, check_integer, check_range, number_or_nan
 from sb3_chac.common.contract import scale_action
 from sb3_chac.common.naming import is_name, named_object
 
@@ -93,9 +93,12 @@ class RiskRule:
         if self.smoothed_action is not None:
             action = self.smoothing * self.smoothed_action + (1 - self.smoothing) * action
         self.smoothed_action = action
-        time = float(self.time_to_trouble(observation, action))
+        answer = self.time_to_trouble(observation, action)
+        time = number_or_nan(answer)
         if math.isnan(time):
-            raise ValueError("time_to_trouble returned NaN: return the time in seconds until trouble, math.inf for none.")
+            raise ValueError(
+                f"time_to_trouble returned {answer!r:.80}: return the time in seconds until trouble, math.inf for none."
+            )
 
         if human_driving:
             self.steps_safe = self.steps_safe + 1 if time > self.hand_back_above else 0

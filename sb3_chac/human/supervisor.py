@@ -10,6 +10,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
+from sb3_chac.common.checks import real_numbers
 from sb3_chac.human.experts import Expert, expert_name, make_expert
 from sb3_chac.human.rules import TakeoverRule, check_rule, make_rule
 
@@ -97,9 +98,12 @@ class Supervisor:
         """
         assert self.expert is not None
         try:
-            values = np.array(within(self.deadline, self.expert, copy.deepcopy(observation)), dtype=np.float64)
+            answer = within(self.deadline, self.expert, copy.deepcopy(observation))
+            values = real_numbers(answer)
         except Exception as error:
             raise self._expert_error(f"raised {type(error).__name__}: {error}.") from error
+        if values is None:
+            raise self._expert_error(f"returned no real numbers, but {answer!r:.80}.")
         low, high = self._box.low.astype(np.float64), self._box.high.astype(np.float64)
         if values.shape != self._box.shape:
             raise self._expert_error(f"returned shape {values.shape}, the action space has {self._box.shape}.")
