@@ -14,6 +14,7 @@ from stable_baselines3.common.logger import configure
 from test_zoo import ZOO
 
 from sb3_chac import CHAC, DPVP
+from sb3_chac.cli.compare import main as compare
 from sb3_chac.cli.evaluate import main as evaluate_command
 from sb3_chac.cli.plot import draw, join
 from sb3_chac.cli.plot import main as plot
@@ -172,6 +173,68 @@ def test_errors_of_plot(tmp_path, monkeypatch, capsys, arguments, message):
         plot(arguments)
     printed = capsys.readouterr().err
     assert error.value.code == 2 and message in printed and printed.count("\n") == 1
+
+
+EVALUATIONS = {"timesteps": [100, 200], "results": np.ones((2, 3)), "successes": np.ones((2, 3), bool)}
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"timesteps": ["100", "200"]},
+        {"timesteps": [100, None]},
+        {"timesteps": [[100], [200]]},
+        {"timesteps": [100, np.nan]},
+        {"timesteps": [100, 200j]},
+        {"timesteps": 100},
+        {"timesteps": [], "results": np.ones((0, 3))},
+        {"results": np.full((2, 3), "1.0")},
+        {"results": [["good", None], [1, 2]]},
+        {"results": np.ones(2)},
+        {"results": np.ones((2, 0))},
+        {"results": np.ones((3, 3))},
+        {"results": np.ones((2, 3, 1))},
+        {"results": np.array([[1, 1], [1, np.inf]])},
+        {"successes": np.ones(2)},
+        {"successes": np.full((2, 3), "yes")},
+    ],
+    ids=str,
+)
+def test_evaluations_that_are_something_else_give_one_line(tmp_path, monkeypatch, capsys, changed):
+    monkeypatch.chdir(tmp_path)
+    folder = write_run(tmp_path / "run", [])
+    arrays = {name: np.array(value) for name, value in {**EVALUATIONS, **changed}.items()}
+    np.savez(folder / "evaluations.npz", **arrays)
+    holds_objects = any(value.dtype == object for value in arrays.values())
+    (name, *_) = changed
+    for command in (plot, compare):
+        with pytest.raises(SystemExit, match="2"):
+            command([str(folder)])
+        printed = capsys.readouterr().err
+        assert f"{folder / 'evaluations.npz'} cannot be read: " in printed and printed.count("\n") == 1
+        assert ("Object arrays" if holds_objects else f"{name} must be finite numbers of shape (") in printed
+    assert not (folder / "curves.png").exists()
+
+
+def test_damaged_evaluations_and_progress_give_one_line(tmp_path, capsys):
+    folder = write_run(tmp_path / "run", [])
+    file = folder / "evaluations.npz"
+    np.savez_compressed(file, **EVALUATIONS)
+    whole = file.read_bytes()
+    start = len(b"PK") + whole.index(b"timesteps.npy") + 30  # among the compressed bytes of the first array
+    damaged = [whole[:start] + bytes(8) + whole[start + 8 :], whole[: len(whole) // 2], b"", b"PK\x03\x04"]
+    np.save(tmp_path / "array.npy", [100, 200])
+    for content in (*damaged, (tmp_path / "array.npy").read_bytes()):
+        file.write_bytes(content)
+        with pytest.raises(SystemExit, match="2"):
+            plot([str(folder)])
+        printed = capsys.readouterr().err
+        assert "evaluations.npz cannot be read: " in printed and printed.count("\n") == 1
+    file.unlink()
+    (folder / "progress.csv").write_text("time/total_timesteps,safety/safety_cost\n100,nan\n")
+    with pytest.raises(SystemExit, match="2"):
+        plot([str(folder)])
+    assert "safety/safety_cost, or the number of steps beside it, is NaN or infinite" in capsys.readouterr().err
 
 
 def test_policies_beside_each_other(toy, tmp_path, capsys):

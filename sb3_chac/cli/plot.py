@@ -4,6 +4,7 @@ import argparse
 import csv
 import math
 import zipfile
+import zlib
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,6 +15,7 @@ from matplotlib.figure import Figure
 from sb3_chac.cli.arguments import check_output
 from sb3_chac.cli.command import run_command
 from sb3_chac.common.callbacks import PROGRESS_FILE
+from sb3_chac.common.checks import real_numbers
 from sb3_chac.evaluation.episodes import NotEvaluable
 from sb3_chac.evaluation.pictures import PLOT_SUFFIXES
 
@@ -27,6 +29,8 @@ drove.
 It reads evaluations.npz and progress.csv in the run folder, and leaves out the panels for which there is nothing."""
 
 EVALUATIONS_FILE = "evaluations.npz"
+# What NumPy, zipfile and csv raise for a file that is damaged or something else
+UNREADABLE = (OSError, ValueError, EOFError, RuntimeError, MemoryError, zipfile.BadZipFile, zlib.error, csv.Error)
 STEPS, STAGE = "time/total_timesteps", "chac/stage"
 
 
@@ -141,7 +145,7 @@ def read_run(folder: Path) -> Curves:
         if file.is_file():
             try:
                 curves |= read(file)
-            except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, csv.Error) as error:
+            except UNREADABLE as error:
                 raise NotPlottable(f"{file} cannot be read: {error}") from error
     curves = {name: curve for name, curve in curves.items() if len(curve)}
     if not curves:
@@ -154,13 +158,39 @@ def read_evaluations(file: Path) -> Curves:
     Read the curves of the evaluations.
 
     :param file: as SB3's EvalCallback writes it
+    :raises ValueError: if there is something else in it
     """
-    with np.load(file) as data:
-        steps, returns = data["timesteps"], data["results"]
-        curves = {"return": np.column_stack([steps, returns.mean(axis=1), returns.std(axis=1)])}
-        if "successes" in data:
-            curves["success"] = np.column_stack([steps, data["successes"].mean(axis=1), np.zeros(len(steps))])
+    loaded = np.load(file)
+    if not isinstance(loaded, np.lib.npyio.NpzFile):
+        raise ValueError("it is no archive of arrays, which SB3's EvalCallback writes.")
+    with loaded as data:
+        found = {name: data[name] for name in ("timesteps", "results", "successes") if name in data}
+    steps = checked_numbers("timesteps", found, 1)
+    returns = checked_numbers("results", found, 2, len(steps))
+    curves = {"return": np.column_stack([steps, returns.mean(axis=1), returns.std(axis=1)])}
+    if "successes" in found:
+        successes = checked_numbers("successes", found, 2, len(steps))
+        curves["success"] = np.column_stack([steps, successes.mean(axis=1), np.zeros(len(steps))])
     return curves
+
+
+def checked_numbers(name: str, arrays: dict[str, np.ndarray], dimensions: int, n: int | None = None) -> np.ndarray:
+    """
+    Take an array of the evaluations.
+
+    :param name: of it
+    :param arrays: of a file
+    :param dimensions: that it must have
+    :param n: length of the first of them, None for any
+    :return: of at least one number each, in float64
+    :raises ValueError: unless it is there, finite numbers, and has this shape
+    """
+    values = real_numbers(arrays.get(name))
+    fits = values is not None and values.ndim == dimensions and n in (None, len(values)) and np.isfinite(values).all()
+    if values is None or not fits or 0 in values.shape:
+        shape = f"({n}, number of episodes)" if dimensions == 2 else "(number of evaluations,)"
+        raise ValueError(f"{name} must be finite numbers of shape {shape}, as SB3's EvalCallback writes them.")
+    return values
 
 
 def read_progress(file: Path) -> Curves:
@@ -168,6 +198,7 @@ def read_progress(file: Path) -> Curves:
     Read the curves of the training.
 
     :param file: as ``CSVProgress`` writes it
+    :raises ValueError: for what is no finite number
     """
     with file.open(newline="") as lines:
         rows = list(csv.DictReader(lines))
@@ -176,6 +207,8 @@ def read_progress(file: Path) -> Curves:
         points = [(float(row[STEPS]), float(row[name]), 0.0) for row in rows if row.get(STEPS) and row.get(name)]
         if points:
             curves[name] = np.array(points)
+            if not np.isfinite(curves[name]).all():
+                raise ValueError(f"{name}, or the number of steps beside it, is NaN or infinite.")
     return curves
 
 
