@@ -1,14 +1,20 @@
 """Mistakes on the command line of ``rl_zoo3 train`` and in its yaml files, and of our own commands: one line each."""
 
+import math
 import re
 import sys
+from pathlib import Path
 
+import gymnasium as gym
 import pytest
+import rl_zoo3
 import yaml
 from test_demo import write_run
 
 from sb3_chac.__main__ import main as sb3_chac
 from sb3_chac.zoo import register
+from sb3_chac.zoo.errors import check_file, check_hyperparameters
+from sb3_chac.zoo.wrappers import check_classes, check_normalization, checked_wrapper
 
 QUICK = ["--eval-freq", "-1", "-n", "10", "-f", "logs"]
 # Arguments of rl_zoo3 train, and what the line must name
@@ -74,6 +80,41 @@ ZOO = [
     ("-params callback:'nowhere.Callback'", "nowhere"),
     ("-params callback:1", "callback"),
     ("-params noise_type:'nonsense'", "noise_type"),
+    ("-params noise_type:'normal'", "noise_std"),
+    ("-params noise_std:0.1", "noise_type"),
+    *(
+        (f"-params noise_type:'normal' noise_std:{value}", "noise_std must be a finite number of at least 0")
+        for value in ("'big'", "-1", "float('nan')", "None", "[0.1]", "True", "1j")
+    ),
+    ("-params n_stack:0", "n_stack"),
+    ("-params frame_stack:1.5", "frame_stack"),
+    *((f"-params {name}:'nope'", name) for name in ("env_wrapper", "vec_env_wrapper", "callback")),
+    *((f"-params {name}:''", name) for name in ("env_wrapper", "vec_env_wrapper", "callback")),
+    *((f"-params {name}:[1]", name) for name in ("env_wrapper", "vec_env_wrapper", "callback")),
+    *((f"-params {name}:['math.nope']", name) for name in ("env_wrapper", "vec_env_wrapper", "callback")),
+    *((f"-params {name}:['math.pi']", name) for name in ("env_wrapper", "vec_env_wrapper", "callback")),
+    *((f"-params {name}:['math.sqrt']", name) for name in ("env_wrapper", "vec_env_wrapper", "callback")),
+    *((f"-params {name}:[{{'a.A':{{}},'b.B':{{}}}}]", name) for name in ("env_wrapper", "vec_env_wrapper", "callback")),
+    *((f"-params {name}:[{{'gymnasium.Wrapper':3}}]", name) for name in ("env_wrapper", "vec_env_wrapper", "callback")),
+    ("-params callback:[{'stable_baselines3.common.callbacks.CheckpointCallback':{'nonsense':1}}]", "nonsense"),
+    ("-params vec_env_wrapper:[{'stable_baselines3.common.vec_env.VecFrameStack':{'n_stack':0}}]", "vec_env_wrapper leaves"),
+    ("-params vec_env_wrapper:[{'stable_baselines3.common.vec_env.VecFrameStack':{'nonsense':1}}]", "nonsense"),
+    ("-params vec_env_wrapper:'gymnasium.wrappers.ClipReward'", "vec_env_wrapper"),
+    ("-params env_wrapper:'stable_baselines3.common.vec_env.VecCheckNan'", "env_wrapper"),
+    ("-params normalize:{'clip_obs':-1}", "normalize"),
+    ("-params normalize:{'clip_obs':0}", "normalize"),
+    ("-params normalize:{'clip_reward':'far'}", "normalize"),
+    ("-params normalize:{'gamma':2}", "normalize"),
+    ("-params normalize:{'epsilon':-1}", "normalize"),
+    ("-params normalize:{'epsilon':float('nan')}", "normalize"),
+    ("-params normalize:{'norm_obs':'no'}", "normalize"),
+    ("-params normalize:{'nonsense':1}", "normalize"),
+    ("-params normalize:{1:1}", "normalize"),
+    ("-params normalize:\"{'clip_obs':-1}\"", "normalize"),
+    ('-params normalize:"dict(norm_obs_keys=3)"', "normalize"),
+    ("-params env_kwargs:3", "env_kwargs"),
+    ("-params monitor_kwargs:{'nonsense':1}", "nonsense"),
+    ("-params replay_buffer_kwargs:{'nonsense':1}", "nonsense"),
     ("-params replay_buffer_class:'nonsense'", "replay_buffer_class"),
     ("-params replay_buffer_kwargs:1", "replay_buffer_kwargs"),
     ("-params monitor_kwargs:1", "monitor_kwargs"),
@@ -104,6 +145,9 @@ FILES = [
     ("Pendulum-v1: {policy: MlpPolicy, n_timesteps: 10, gamma: }", "gamma"),
     ("Pendulum-v1: {policy: , n_timesteps: 10}", "policy"),
     ("1: {policy: MlpPolicy, n_timesteps: 10}", "Pendulum-v1"),
+    ("Pendulum-v1: {policy: MlpPolicy, n_timesteps: 10}\nPendulum-v1: {policy: }", "'Pendulum-v1' twice, in lines 1 and 2"),
+    ("Pendulum-v1: {policy: MlpPolicy, n_timesteps: 10, gamma: 0.9, gamma: 0.99}", "'gamma' twice"),
+    ("Pendulum-v1:\n  policy: MlpPolicy\n  n_timesteps: 10\n  normalize: {gamma: 0.9, gamma: 0.99}", "'gamma' twice"),
 ]
 
 
@@ -147,9 +191,40 @@ def test_hyperparameters_files(complaint, tmp_path, content, named):
     assert named in complaint(["train", "--algo", "dsac", "--env", "Pendulum-v1", *quick, "--conf-file", "bad.yml"])
 
 
-def test_numbers_of_rl_zoo3_files_are_fine():
-    from sb3_chac.zoo.errors import check_hyperparameters
+def test_what_files_may_hold(tmp_path):
+    """Another environment's entry, merged keys and aliases in circles are none of our business."""
+    file = tmp_path / "good.yml"
+    file.write_text(
+        "default: &base {policy: MlpPolicy, n_timesteps: 10, gamma: 0.9}\n"
+        "Other-v0: {}\nOther-v0: {gamma: 1, gamma: 2}\n"
+        "Pendulum-v1: {<<: *base, gamma: 0.99, policy_kwargs: &circle {again: *circle}}\n"
+    )
+    check_file(str(file), "Pendulum-v1")
+    with pytest.raises(ValueError, match=r"'Other-v0' twice, in lines 2 and 3: remove one\."):
+        check_file(str(file), "Other-v0")
 
+
+def test_hyperparameters_of_rl_zoo3_and_ours_are_fine():
+    folders = (Path(__file__).parent.parent, Path(rl_zoo3.__file__).parent)
+    checked = 0
+    for file in [file for folder in folders for file in folder.glob("hyperparams/*.yml")]:
+        for env_id, hyperparams in yaml.safe_load(file.read_text()).items():
+            check_file(str(file), env_id)
+            check_hyperparameters({**hyperparams, "env_wrapper": None}, 10)  # some are of packages that are not installed
+            checked += 1
+    assert checked > 100
+
+
+def test_wrappers_and_normalization_that_are_fine():
+    limit = {"gymnasium.wrappers.TimeLimit": {"max_episode_steps": 5}}
+    check_classes({"env_wrapper": ["rl_zoo3.wrappers.TimeFeatureWrapper", limit], "callback": None, "vec_env_wrapper": []})
+    check_normalization({"clip_obs": math.inf, "clip_reward": 5, "norm_obs": False, "gamma": 1.0})
+    wrap = checked_wrapper("env_wrapper", lambda env: gym.wrappers.TimeLimit(env, 5))
+    assert isinstance(wrap(gym.make("Pendulum-v1")), gym.wrappers.TimeLimit)
+    assert checked_wrapper("env_wrapper", None) is None
+
+
+def test_numbers_of_rl_zoo3_files_are_fine():
     check_hyperparameters(yaml.safe_load("{policy: MlpPolicy, n_timesteps: !!float 1e6, learning_rate: lin_7.3e-4}"), -1)
 
 

@@ -13,6 +13,8 @@ from typing import Any
 import yaml
 
 from sb3_chac.common.arguments import describe
+from sb3_chac.common.checks import check_range
+from sb3_chac.zoo.wrappers import check_classes, check_normalization
 
 TRACEBACK = "SB3_CHAC_TRACEBACK"  # environment variable that brings it back
 
@@ -26,6 +28,7 @@ KINDS = {
     "policy_kwargs": dict | str,
     "replay_buffer_kwargs": dict | str,
     "monitor_kwargs": dict | str,
+    "env_kwargs": dict,
 }
 EVALUATED = ("policy_kwargs", "replay_buffer_class", "replay_buffer_kwargs", "monitor_kwargs", "normalize")  # if they are text
 NOISES = ("normal", "ornstein-uhlenbeck")
@@ -91,14 +94,46 @@ def check_file(config: str, env_id: str) -> None:
     if Path(config).suffix not in (".yml", ".yaml"):
         return
     try:
-        content = yaml.safe_load(Path(config).read_text())
+        text = Path(config).read_text()
+        content = yaml.safe_load(text)
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise ValueError(f"{config} is no YAML: {error}") from error
     if not isinstance(content, dict) or not content:
         raise ValueError(f"{config} must map environments to their hyperparameters, it holds {content!r:.60}.")
+    check_twice(config, yaml.compose(text, yaml.SafeLoader), env_id if env_id in content else "default")
     found = content.get(env_id, content.get("default", {}))
     if not isinstance(found, dict):
         raise ValueError(f"{config}: the hyperparameters of {env_id} must be a mapping, got {found!r:.60}.")
+
+
+def check_twice(config: str, node: yaml.Node, entry: str) -> None:
+    """
+    Check that nothing is written twice: YAML would take the last one.
+
+    :param config: hyperparameters file, for the message
+    :param node: of its content, a mapping
+    :param entry: of the environment; those of others are left alone
+    :raises ValueError: names what is there twice
+    """
+    seen: set[int] = set()  # aliases may lead in circles
+
+    def check(node: yaml.Node, keys_of_interest: tuple[str, ...] | None = None) -> None:
+        if id(node) in seen:
+            return
+        seen.add(id(node))
+        lines: dict[str, int] = {}
+        for part in node.value if isinstance(node, yaml.MappingNode | yaml.SequenceNode) else ():
+            key, value = part if isinstance(part, tuple) else (None, part)
+            if key is not None and isinstance(key, yaml.ScalarNode):
+                if keys_of_interest is not None and key.value not in keys_of_interest:
+                    continue
+                line = key.start_mark.line + 1
+                if key.value in lines:
+                    raise ValueError(f"{config} has {key.value!r} twice, in lines {lines[key.value]} and {line}: remove one.")
+                lines[key.value] = line
+            check(value)
+
+    check(node, (entry,))
 
 
 def check_hyperparameters(hyperparams: dict[str, Any], n_timesteps: int) -> None:
@@ -121,11 +156,10 @@ def check_hyperparameters(hyperparams: dict[str, Any], n_timesteps: int) -> None
             raise ValueError(f"{name} must be {describe(kinds)}, got {hyperparams[name]!r}.")
     if not isinstance(hyperparams.get("policy"), str):
         raise ValueError(f"policy must be the name of one, such as MlpPolicy, got {hyperparams.get('policy')!r}.")
-    if "noise_type" in hyperparams:
-        if not any(known in str(hyperparams["noise_type"]) for known in NOISES):
-            raise ValueError(f"noise_type must be one of {', '.join(NOISES)}, got {hyperparams['noise_type']!r}.")
-        if "noise_std" not in hyperparams:
-            raise ValueError("noise_type needs noise_std, the standard deviation of the noise.")
+    check_noise(hyperparams)
+    check_classes(hyperparams)
+    if isinstance(hyperparams.get("normalize"), dict):
+        check_normalization(hyperparams["normalize"])
     if n_timesteps <= 0 and "n_timesteps" not in hyperparams:
         raise ValueError("n_timesteps is missing: give -n, or write it into the yaml.")
     for name, low in (("n_timesteps", 1), ("n_envs", 1), ("frame_stack", 1)):
@@ -133,6 +167,22 @@ def check_hyperparameters(hyperparams: dict[str, Any], n_timesteps: int) -> None
         # RL-Zoo3's own files write 1e6, which is a float
         if value is not None and (isinstance(value, bool | str) or not is_whole(value) or value < low):
             raise ValueError(f"{name} must be a whole number of at least {low}, got {value!r}.")
+
+
+def check_noise(hyperparams: dict[str, Any]) -> None:
+    """
+    Check the noise that is added to actions.
+
+    :param hyperparams: of RL-Zoo3
+    :raises ValueError: for a type that is none, a standard deviation that is none, or one without the other
+    """
+    if "noise_type" not in hyperparams and "noise_std" not in hyperparams:
+        return
+    if not any(known in str(hyperparams.get("noise_type")) for known in NOISES):
+        raise ValueError(f"noise_type must be one of {', '.join(NOISES)}, got {hyperparams.get('noise_type')!r}.")
+    if "noise_std" not in hyperparams:
+        raise ValueError("noise_type needs noise_std, the standard deviation of the noise.")
+    check_range("noise_std", hyperparams["noise_std"], low=0.0)
 
 
 @contextmanager

@@ -26,6 +26,7 @@ from sb3_chac.envs import ENVIRONMENTS, ONE_PER_PROCESS, VALIDATION
 from sb3_chac.human.supervisor import ExpertError, RuleError
 from sb3_chac.zoo.algorithms import ALGORITHMS, hyperparams_file
 from sb3_chac.zoo.errors import check_file, check_hyperparameters, check_options, evaluating, one_line
+from sb3_chac.zoo.wrappers import check_normalization, checked_wrapper
 
 # Steps between two checkpoints unless --save-freq says otherwise: what a person does at most for nothing
 SAVE_FREQ = 10_000
@@ -135,15 +136,23 @@ def end_processes(env: SubprocVecEnv) -> None:
 
 
 def preprocess_hyperparams(original: Callable[..., Any], manager: Any, hyperparams: dict[str, Any]) -> Any:
-    """Our environments are evaluated on maps that are neither those of the training nor those of the final test."""
-    if is_ours(manager):
-        check_hyperparameters(hyperparams, manager.n_timesteps)
+    """
+    Mistakes are named before anything is made. Our environments are evaluated on maps that are neither those of the training
+    nor those of the final test.
+    """
+    if not is_ours(manager):
+        return original(hyperparams)
+    check_hyperparameters(hyperparams, manager.n_timesteps)
+    is_text = isinstance(hyperparams.get("normalize"), str)
     with evaluating(hyperparams):
-        processed = original(hyperparams)
+        hyperparams, env_wrapper, callbacks, vec_env_wrapper = original(hyperparams)
+    if is_text:
+        check_normalization(manager.normalize_kwargs)
     env_id = manager.env_name.gym_id
     if manager._eval_env_kwargs_args is None and env_id in VALIDATION:
         manager.eval_env_kwargs = {**manager.env_kwargs, **VALIDATION[env_id]}
-    return processed
+    wrappers = checked_wrapper("env_wrapper", env_wrapper), checked_wrapper("vec_env_wrapper", vec_env_wrapper)
+    return hyperparams, wrappers[0], callbacks, wrappers[1]
 
 
 def create_callbacks(original: Callable[..., None], manager: Any) -> None:
