@@ -12,10 +12,13 @@ import imageio.v3 as imageio
 import numpy as np
 import pytest
 import toy_env
+from eleven import Walk, make_any
+from rl_zoo3 import utils
 from sb3_contrib import TQC, RecurrentPPO
 from shell import run
 from stable_baselines3 import A2C, DDPG, DQN, PPO, SAC, TD3
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from stable_baselines3.sac.policies import SACPolicy
 
 from sb3_chac import DSAC
 from sb3_chac.cli.demos import main as demos
@@ -24,6 +27,7 @@ from sb3_chac.common.demonstrations import load_demonstrations
 from sb3_chac.evaluation.episodes import NotEvaluable
 from sb3_chac.evaluation.evaluation import evaluate, scenario_list
 from sb3_chac.evaluation.models import find_algorithm
+from sb3_chac.zoo.algorithms import ALGORITHMS
 
 TOY = "toy_env:ToyDrive-v0"
 QUICK = {"learning_starts": 10, "buffer_size": 100, "seed": 0}
@@ -239,6 +243,32 @@ def test_td3_and_ddpg_are_told_apart_by_the_path(algo, algorithm, tmp_path, caps
     assert find_algorithm(tmp_path / "x.zip", algo)[2] is algorithm
 
 
+@pytest.mark.parametrize("algo, name", ALGORITHMS.items())
+def test_a_model_of_another_algorithm_is_refused(algo, name, tmp_path):
+    path = tmp_path / f"{algo}-Walk-v0.zip"
+    make_any(name, Walk()).save(path)
+    assert find_algorithm(path, None)[1] == find_algorithm(path, algo)[1] == algo
+    twins = {"hg_dagger", "iwr"}  # store the same
+    savers = twins if algo in twins else {algo}
+    others = set(utils.ALGOS) - savers
+    assert set(ALGORITHMS) - savers < others
+    for other in others:
+        saved_by = " or ".join(sorted(savers))
+        with pytest.raises(
+            NotEvaluable, match=rf"^--algo {other}: \S+.zip was saved by {saved_by}: give that, or leave --algo"
+        ):
+            find_algorithm(path, other)
+
+
+class OwnPolicy(SACPolicy):
+    """A user's, which tells nothing of the algorithm."""
+
+
+def test_a_policy_of_ones_own_leaves_the_algorithm_to_the_user(tmp_path):
+    SAC(OwnPolicy, TOY, **QUICK).save(tmp_path / "x.zip")
+    assert find_algorithm(tmp_path / "x.zip", "sac")[2] is SAC
+
+
 @pytest.mark.parametrize("text, expected", [("1000", [1000]), ("3:5", [3, 4]), ("7, 1:3", [7, 1, 2]), (range(2), [0, 1])])
 def test_scenarios(text, expected):
     assert scenario_list(text) == expected
@@ -258,7 +288,7 @@ def test_malformed_scenarios(text):
         (["nothing.zip"], "no model nothing.zip"),
         (["toy.txt"], "toy.txt is not a model saved by Stable-Baselines3"),
         (["model.zip", "--algo", "sarsa"], "--algo 'sarsa' is not known, choose from a2c"),
-        (["model.zip", "--algo", "dqn"], "model.zip cannot be loaded as dqn"),
+        (["model.zip", "--algo", "dqn"], "--algo dqn: model.zip was saved by sac: give that, or leave --algo out"),
         (["model.zip", "--env", "Pendulum-v1", "--episodes", "1"], "Observation spaces do not match"),
         (["model.zip", "--env", "toy_env:BlindDrive-v0"], "cannot be loaded as sac"),
         (["--expert", "mad"], "expert 'mad' is not available"),

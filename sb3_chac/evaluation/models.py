@@ -44,7 +44,7 @@ def find_algorithm(path: Path, algo: str | None) -> tuple[Path, str, type[BaseAl
         with it tell, and the path where they do not
     :return: path of the file, name and class of the algorithm
     :raises FileNotFoundError: if there is no such file
-    :raises NotEvaluable: if it is not a model of Stable-Baselines3, or its algorithm is not known
+    :raises NotEvaluable: if it is not a model of Stable-Baselines3, its algorithm is not known, or is another than ``algo``
     """
     add_algorithms(utils)
     if algo is not None and algo not in utils.ALGOS:
@@ -59,21 +59,22 @@ def find_algorithm(path: Path, algo: str | None) -> tuple[Path, str, type[BaseAl
         module = data["policy_class"]["__module__"]
     except (zipfile.BadZipFile, KeyError, ValueError, TypeError) as error:
         raise NotEvaluable(f"{path} is not a model saved by Stable-Baselines3.") from error
+    savers = possible_algorithms(module, set(data), utils.ALGOS)
     if algo is None:
-        algo = guess_algorithm(path, module, set(data), utils.ALGOS)
+        algo = choose_by_path(path, savers or list(utils.ALGOS))
+    elif savers and algo not in savers:
+        raise NotEvaluable(f"--algo {algo}: {path} was saved by {' or '.join(savers)}: give that, or leave --algo out.")
     return path, algo, utils.ALGOS[algo]
 
 
-def guess_algorithm(path: Path, module: str, stored: set[str], algorithms: dict[str, type[BaseAlgorithm]]) -> str:
+def possible_algorithms(module: str, stored: set[str], algorithms: dict[str, type[BaseAlgorithm]]) -> list[str]:
     """
-    Guess the algorithm of a saved model.
+    Find out which algorithms may have saved a model.
 
-    :param path: of the saved model, e.g. logs/<algo>/<env>_1/<env>.zip or <algo>-<env>.zip
     :param module: the one that defines its policy
     :param stored: names of the attributes stored with it
     :param algorithms: classes by name
-    :return: name of the algorithm
-    :raises NotEvaluable: if it is ambiguous
+    :return: names of those that have such policies, and whose arguments fit best; none if the policy is a user's
     """
 
     def fit(algo: str) -> int:
@@ -86,11 +87,20 @@ def guess_algorithm(path: Path, module: str, stored: set[str], algorithms: dict[
         if module in {policy.__module__ for policy in algorithm.policy_aliases.values()}
     ]
     best = [algo for algo in candidates if fit(algo) == max(map(fit, candidates))]
-    if "td3" in best:
-        best = ["ddpg", "td3"]  # DDPG stores what TD3 stores
-    if len(best) == 1:
-        return best[0]
-    candidates = best or list(algorithms)
+    return ["ddpg", "td3"] if "td3" in best else best  # DDPG stores what TD3 stores
+
+
+def choose_by_path(path: Path, candidates: list[str]) -> str:
+    """
+    Choose the algorithm that the path of a saved model names.
+
+    :param path: of the saved model, e.g. logs/<algo>/<env>_1/<env>.zip or <algo>-<env>.zip
+    :param candidates: names of algorithms that may have saved it
+    :return: name of the algorithm, the only candidate whatever the path
+    :raises NotEvaluable: if the path names none
+    """
+    if len(candidates) == 1:
+        return candidates[0]
     folders = {folder.name for folder in path.resolve().parents[:2]}
     named = [
         algo for algo in candidates if algo in folders or path.stem == algo or path.name.startswith((f"{algo}-", f"{algo}_"))
