@@ -140,6 +140,20 @@ def test_expert_alone_and_a_folder_in_place_of_an_id(tmp_path, datasets):
     assert not datasets.exists() or not list(datasets.iterdir())
 
 
+@pytest.mark.parametrize(
+    "folder, dataset_id",
+    [("./ds", "ds-v0"), ("./two words.2", "two-words-2-v0"), ("./ds-v3", "ds-v3"), ("./_", "dataset-v0"), ("./a/b", "b-v0")],
+)
+def test_any_folder_can_be_named(folder, dataset_id, tmp_path, datasets, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    named = ["--dataset", folder]
+    command(["record", "--expert", "scripted", "--env", TOY, "--steps", "5", "--jobs", "1", *named])
+    assert f"{dataset_id}: " in capsys.readouterr().out and (tmp_path / folder / "data").is_dir()
+    command(["info", *named])
+    assert f"{dataset_id}: " in capsys.readouterr().out
+    assert load_demonstrations(folder).actions.all() and not datasets.exists()
+
+
 def test_the_dataset_does_not_depend_on_the_number_of_processes(tmp_path):
     model = SAC("MlpPolicy", TOY, buffer_size=10, seed=0)
     folders = [record(tmp_path / f"jobs{jobs}-v0", model, TOY, 45, seed=3, jobs=jobs) for jobs in (1, 2)]
@@ -496,3 +510,21 @@ def test_replay_of_damaged_data_ends_with_one_line(capsys, tmp_path, harm):
         command(["replay", "--dataset", "pendulum/still-v0"])
     error = capsys.readouterr().err.strip()
     assert ended.value.code == 2 and "pendulum/still-v0" in error and "\n" not in error
+
+
+@pytest.mark.parametrize("data_format", ["hdf5", "arrow"])
+@pytest.mark.parametrize("named", [2, 10**9, 10**30, "many"])
+def test_episodes_that_are_named_and_not_there(capsys, data_format, named):
+    still = lambda observation: np.zeros(1, np.float32)  # noqa: E731
+    folder = record("pendulum/still-v0", still, "Pendulum-v1", 1) / "data"
+    metadata = json.loads((folder / "metadata.json").read_text())
+    if data_format == "arrow":
+        (folder / "main_data.hdf5").unlink()
+        (folder / "0").mkdir()
+    (folder / "metadata.json").write_text(json.dumps(metadata | {"total_episodes": named, "data_format": data_format}))
+    for arguments in (["info"], ["replay"]):
+        with pytest.raises(SystemExit) as ended:
+            command([*arguments, "--dataset", "pendulum/still-v0"])
+        error = capsys.readouterr().err
+        assert ended.value.code == 2 and error.count("\n") == 1 and "it is damaged" in error
+        assert isinstance(named, str) or f"metadata.json names {named} episodes, but 1 are there" in error

@@ -42,7 +42,7 @@ def open_dataset(dataset: "str | os.PathLike[str] | MinariDataset") -> "MinariDa
         opened, name = dataset, f"dataset {dataset.id!r}"
     else:
         folder, name = find_dataset(dataset), f"dataset {os.fspath(dataset)!r}"
-        check_version(folder, name)
+        check_metadata(folder, name)
         try:
             opened = MinariDataset(folder)
         except Exception as error:  # whatever a damaged file leads to
@@ -56,18 +56,20 @@ def open_dataset(dataset: "str | os.PathLike[str] | MinariDataset") -> "MinariDa
     return opened
 
 
-def check_version(folder: Path, name: str) -> None:
+def check_metadata(folder: Path, name: str) -> None:
     """
-    Check that Minari can read a dataset.
+    Check that Minari can read a dataset, and that the episodes that it names are there: Minari would look for each of them.
 
     :param folder: that holds the data
     :param name: of the dataset, for the message
-    :raises DatasetError: if the installed Minari cannot read what another version has written
+    :raises DatasetError: if the installed Minari cannot read what another version has written, or episodes are missing
     """
     from minari import __version__, supported_dataset_versions
 
     try:
-        version = json.loads((folder / "metadata.json").read_text())["minari_version"]
+        metadata = json.loads((folder / "metadata.json").read_text())
+        version = metadata["minari_version"]
+        episodes, data_format = metadata.get("total_episodes"), metadata.get("data_format")
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return  # not Minari's, which it says itself
     if version not in supported_dataset_versions:
@@ -76,6 +78,30 @@ def check_version(folder: Path, name: str) -> None:
             f"{', '.join(sorted(supported_dataset_versions))}). Install a version that can (pip install minari=={version}), "
             "or record or download the dataset anew."
         )
+    file = folder / "main_data.hdf5"
+    if not isinstance(episodes, int) or (data_format == "hdf5" and not file.is_file()):
+        return  # likewise
+    found = len(groups_in(file, name)) if data_format == "hdf5" else sum(part.is_dir() for part in folder.iterdir())
+    if episodes > found:
+        raise damaged(name, f"metadata.json names {episodes} episodes, but {found} are there")
+
+
+def groups_in(file: Path, name: str) -> list[str]:
+    """
+    List the groups of a file of Minari, one for each episode.
+
+    :param name: of the dataset, for the message
+    :raises DatasetError: if it is no HDF5
+    """
+    import h5py
+
+    if not file.stat().st_size:
+        return []  # as it is before the first episode
+    try:
+        with h5py.File(file, "r") as opened:
+            return list(opened)
+    except Exception as error:  # nearly any
+        raise damaged(name, error) from error
 
 
 def find_dataset(dataset: str | os.PathLike[str]) -> Path:

@@ -2,6 +2,7 @@
 
 import importlib.metadata
 import os
+import re
 import tempfile
 from dataclasses import replace
 from pathlib import Path
@@ -100,13 +101,16 @@ def folder_to_make(dataset: str | os.PathLike[str], overwrite: bool) -> Path:
 
     :param dataset: id for Minari's folder, or the folder to make: an absolute one, or one that begins with "."
     :return: the folder of the dataset
-    :raises DatasetError: for a name that Minari does not take, or one that is taken
+    :raises DatasetError: for an id that Minari does not take, or a name that is taken
     """
     name = os.fspath(dataset)
     is_folder = not isinstance(dataset, str) or name.startswith(".") or os.path.isabs(name)
     folder = Path(name).absolute() if is_folder else minari_folder().absolute() / name
     if not is_dataset_id(dataset_id_of(folder)):
-        raise DatasetError(f"dataset: the name must look like safedrive/scripted-v0, with a version at its end, got {name!r}.")
+        raise DatasetError(
+            "dataset: the name must look like safedrive/scripted-v0, with a version at its end, or like ./scripted, a folder "
+            f"outside of Minari's, got {name!r}."
+        )
     check_free(folder, overwrite)
     return folder
 
@@ -129,10 +133,14 @@ def dataset_id_of(folder: Path) -> str:
     """
     Return the id of a dataset.
 
-    :return: the id under which Minari finds the dataset, or the name of its folder if it is kept elsewhere
+    :return: the id under which Minari finds the dataset, or if it is kept elsewhere the name of its folder, as an id of Minari
     """
     root = minari_folder().absolute()
-    return folder.relative_to(root).as_posix() if folder.is_relative_to(root) else folder.name
+    if folder.is_relative_to(root):
+        return folder.relative_to(root).as_posix()
+    if is_dataset_id(folder.name):
+        return folder.name
+    return f"{re.sub('[^A-Za-z0-9]+', '-', folder.name).strip('-') or 'dataset'}-v0"
 
 
 def make_namespace(dataset_id: str) -> None:
