@@ -544,7 +544,7 @@ class CHAC(DPVP):
         self: SelfCHAC,
         total_timesteps: int,
         callback: MaybeCallback = None,
-        log_interval: int = 4,
+        log_interval: int | None = 4,
         tb_log_name: str = "CHAC",
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,

@@ -154,7 +154,7 @@ class GuidedOffPolicyAlgorithm(CheckedOffPolicyAlgorithm):
         self: SelfGuided,
         total_timesteps: int,
         callback: MaybeCallback = None,
-        log_interval: int = 4,
+        log_interval: int | None = 4,
         tb_log_name: str = "run",
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,

@@ -260,7 +260,7 @@ class DPVP(GuidedOffPolicyAlgorithm, DSAC):
         self: SelfDPVP,
         total_timesteps: int,
         callback: MaybeCallback = None,
-        log_interval: int = 4,
+        log_interval: int | None = 4,
         tb_log_name: str = "DPVP",
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,

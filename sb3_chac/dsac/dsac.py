@@ -362,7 +362,7 @@ class DSAC(CheckedOffPolicyAlgorithm):
         self: SelfDSAC,
         total_timesteps: int,
         callback: MaybeCallback = None,
-        log_interval: int = 4,
+        log_interval: int | None = 4,
         tb_log_name: str = "DSAC",
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,

@@ -334,7 +334,7 @@ class GAIL(CheckedRollouts, PPO):
         self: SelfGAIL,
         total_timesteps: int,
         callback: MaybeCallback = None,
-        log_interval: int = 1,
+        log_interval: int | None = 1,
         tb_log_name: str = "GAIL",
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,

@@ -281,7 +281,7 @@ class HGDagger(GuidedOffPolicyAlgorithm):
         self: SelfHGDagger,
         total_timesteps: int,
         callback: MaybeCallback = None,
-        log_interval: int = 4,
+        log_interval: int | None = 4,
         tb_log_name: str = "HGDagger",
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,

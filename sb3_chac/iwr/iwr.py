@@ -33,7 +33,7 @@ class IWR(HGDagger):
         self: SelfIWR,
         total_timesteps: int,
         callback: MaybeCallback = None,
-        log_interval: int = 4,
+        log_interval: int | None = 4,
         tb_log_name: str = "IWR",
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,

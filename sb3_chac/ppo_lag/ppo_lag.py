@@ -347,7 +347,7 @@ class PPOLag(CostConstrainedAlgorithm, CheckedRollouts, PPO):
         self: SelfPPOLag,
         total_timesteps: int,
         callback: MaybeCallback = None,
-        log_interval: int = 1,
+        log_interval: int | None = 1,
         tb_log_name: str = "PPOLag",
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,

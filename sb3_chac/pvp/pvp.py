@@ -223,7 +223,7 @@ class PVP(GuidedOffPolicyAlgorithm, TD3):
         self: SelfPVP,
         total_timesteps: int,
         callback: MaybeCallback = None,
-        log_interval: int = 4,
+        log_interval: int | None = 4,
         tb_log_name: str = "PVP",
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,

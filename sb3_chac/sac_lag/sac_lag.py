@@ -328,7 +328,7 @@ class SACLag(CostConstrainedAlgorithm, CheckedOffPolicyAlgorithm, SAC):
         self: SelfSACLag,
         total_timesteps: int,
         callback: MaybeCallback = None,
-        log_interval: int = 4,
+        log_interval: int | None = 4,
         tb_log_name: str = "SACLag",
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,

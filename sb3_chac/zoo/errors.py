@@ -106,7 +106,7 @@ def check_file(config: str, env_id: str) -> None:
         raise ValueError(f"{config}: the hyperparameters of {env_id} must be a mapping, got {found!r:.60}.")
 
 
-def check_twice(config: str, node: yaml.Node, entry: str) -> None:
+def check_twice(config: str, node: yaml.Node | None, entry: str) -> None:
     """
     Check that nothing is written twice: YAML would take the last one.
 
@@ -117,7 +117,7 @@ def check_twice(config: str, node: yaml.Node, entry: str) -> None:
     """
     seen: set[int] = set()  # aliases may lead in circles
 
-    def check(node: yaml.Node, keys_of_interest: tuple[str, ...] | None = None) -> None:
+    def check(node: yaml.Node | None, keys_of_interest: tuple[str, ...] | None = None) -> None:
         if id(node) in seen:
             return
         seen.add(id(node))

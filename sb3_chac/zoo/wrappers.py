@@ -26,13 +26,13 @@ def check_classes(hyperparams: dict[str, Any]) -> None:
     for key in CLASSES:
         value = hyperparams.get(key)
         for entry in value if isinstance(value, list) else [] if value is None else [value]:
-            name, kwargs = entry, {}
+            name = entry
             if isinstance(entry, dict):
                 if len(entry) != 1:
                     raise ValueError(f"{key}: {entry!r:.80} must be one class with its arguments, check the indentation.")
                 ((name, kwargs),) = entry.items()
-            if not isinstance(kwargs, dict):
-                raise ValueError(f"{key}: the arguments of {name} must be a mapping, got {kwargs!r:.80}.")
+                if not isinstance(kwargs, dict):
+                    raise ValueError(f"{key}: the arguments of {name} must be a mapping, got {kwargs!r:.80}.")
             found = named_class(key, name) if isinstance(name, str) else name
             is_one = isinstance(found, type) and issubclass(found, BaseCallback)
             if key == "callback" and not (is_one or isinstance(found, BaseCallback)):
