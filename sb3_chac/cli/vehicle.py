@@ -73,6 +73,7 @@ def run(args: argparse.Namespace) -> None:
             raise NotDeployable(f"--{option} must be at least {low}, got {value}.")
     env: gym.Env = make_env(args.env, parse_env_kwargs(args.env_kwargs))
     try:
+        env.reset()  # compiles and loads, which takes longer than a learner waits for an answer
         env = InterventionWrapper(env, expert=args.expert, rule=args.rule, budget=args.budget, armed=True)
         env = LateLink(env, args.latency, args.jitter, args.loss, args.noise, args.seed)
         with bound_socket("--listen", address) as sock:
