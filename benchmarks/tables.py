@@ -190,6 +190,20 @@ def seeds(folder: Path = WITH) -> str:
     return curves.markdown(rows)
 
 
+def second_stage(folder: Path = WITH) -> str:
+    """
+    :return: a row for each run of C-HAC: the end of stage 1 and each evaluation of stage 2
+    """
+    runs = [[read(folder / path.name.replace("chac", "chac-stage-1"))[-1], *read(path)] for path in files(folder, "chac")]
+    steps = [thousands(float(row["step"])) for row in max(runs, key=len, default=[])]
+    rows = [["seed", *(step + " (stage 1)" * (idx == 0) for idx, step in enumerate(steps)), "collisions in stage 2"]]
+    for run in runs:
+        cells = [f"{float(r['cost_mean']):.2f}, {float(r['success_rate']):.3f}, {float(r['return_mean']):.1f}" for r in run]
+        collisions = str(int(run[-1]["training_cost"]) - int(run[0]["training_cost"]))
+        rows.append([run[0]["seed"], *cells, *[""] * (len(steps) - len(cells)), collisions])
+    return curves.markdown(rows)
+
+
 def ablations(folder: Path = WITHOUT, after: int = 50_000) -> str:
     """
     :param after: steps of stage 2 that are looked at
@@ -312,6 +326,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "headline": headline,
     "guidance": partial(guidance, WITH),
     "guidance-seeds": seeds,
+    "second-stage": second_stage,
     "guidance-without-corridors": partial(guidance, WITHOUT),
     "ablations": ablations,
     "metadrive-without-corridors": partial(guidance, METADRIVE, paper=True),
