@@ -10,7 +10,7 @@ from importlib import import_module
 # Name -> module
 OWN_COMMANDS = {
     name: f"sb3_chac.cli.{name}"
-    for name in ("drive", "evaluate", "resume", "plot", "compare", "demos", "export", "run", "vehicle")
+    for name in ("drive", "evaluate", "resume", "plot", "compare", "demos", "export", "run", "vehicle", "study")
 }
 COMMANDS = ("train", "enjoy", "plot_train", "plot_from_file", "all_plots", *OWN_COMMANDS)
 
@@ -18,6 +18,7 @@ USAGE = f"""usage: sb3-chac {{{",".join(COMMANDS)}}} ...
 
 RL-Zoo3's commands with the algorithms of sb3_chac, and
   drive                 train with yourself as the human, in a window: keyboard, gamepad or steering wheel
+  study PROTOCOL.yaml   a study with people at the wheel: consent, practice, conditions in turn, NASA-TLX
   evaluate MODEL.zip    a model or an expert on held-out scenarios
   resume RUN_FOLDER     go on with a training that was interrupted or killed, from its newest checkpoint
   plot RUN_FOLDER       its curves: return, success rate, safety cost, what the human drove

@@ -75,6 +75,9 @@ def make_parser() -> argparse.ArgumentParser:
     how.add_argument(
         "--query", type=float, metavar="RISK", help="the novice asks for help from this risk on, for example 0.95"
     )
+    how.add_argument("--no-meter", action="store_true", help="do not show the guidance meter")
+    how.add_argument("--no-takeover", action="store_true", help="watch only")
+    how.add_argument("--no-learning", action="store_true", help="the novice (-i MODEL) stays as it is, and does not explore")
     how.add_argument("--go", action="store_true", help="begin at once, do not wait for P")
     where = parser.add_argument_group("what is written")
     where.add_argument("-f", "--log-folder", default="logs", help="(default: %(default)s)")
@@ -116,7 +119,7 @@ def run(arguments: list[str], args: argparse.Namespace) -> None:
     elif args.recover:
         recover(args.recover)
     else:
-        begin_or_resume(args, arguments)
+        drive(prepare(arguments))
 
 
 def recover(run_folder: Path) -> None:
@@ -134,16 +137,18 @@ def recover(run_folder: Path) -> None:
     print(summary)
 
 
-def begin_or_resume(args: argparse.Namespace, arguments: list[str]) -> None:
+def prepare(arguments: list[str]) -> argparse.Namespace:
     """
-    Begin or resume a drive.
+    Prepare a drive that begins or is resumed.
 
-    :param args: see ``make_parser``
-    :param arguments: that they come from
+    :param arguments: of the command line
+    :return: see ``make_parser``, checked
+    :raises NotDrivable: for what does not fit, or cannot be resumed
     """
     from sb3_chac.cockpit.recording import finish_recording
     from sb3_chac.zoo.runs import NotResumable, find_training
 
+    args = make_parser().parse_args(arguments)
     if args.resume:
         try:
             command, checkpoint = find_training(args.resume)
@@ -161,7 +166,7 @@ def begin_or_resume(args: argparse.Namespace, arguments: list[str]) -> None:
     check_arguments(args)
     # What RL-Zoo3 writes into the run folder, and 'sb3-chac resume' repeats
     sys.argv[1:] = ["drive", *arguments]
-    drive(args)
+    return args
 
 
 def without(option: str, arguments: list[str]) -> list[str]:
@@ -215,6 +220,10 @@ def check_arguments(args: argparse.Namespace) -> None:
             raise NotDrivable(f"--{option.replace('_', '-')} must be at least {low}, got {getattr(args, option)}.")
     if args.trained_agent and not Path(args.trained_agent).is_file():
         raise NotDrivable(f"--trained-agent: there is no file {args.trained_agent}.")
+    if args.no_learning and not args.trained_agent:
+        raise NotDrivable("--no-learning needs a model that can drive: -i MODEL.zip.")
+    if args.query is not None and (args.no_meter or args.no_takeover):
+        raise NotDrivable("--query asks for help by the meter: leave out --no-meter and --no-takeover.")
     if args.pretrain and not args.demos:
         raise NotDrivable("--pretrain needs --demos: there is nothing to learn from before the drive.")
     check_numbers(args)
@@ -285,13 +294,17 @@ def in_browser(args: argparse.Namespace) -> Any:
     """
     from sb3_chac.cockpit.devices.browser import Browser
     from sb3_chac.cockpit.experiment import CockpitRun
-    from sb3_chac.cockpit.server import serve, tls_context
+    from sb3_chac.cockpit.server import Server, serve, tls_context
 
     tls = tls_context(args.tls_cert, args.tls_key) if args.tls_cert else None
     device = Browser()
     drive_run = CockpitRun(args, device)
-    asyncio.run(serve(drive_run.drive, device, args.serve, lambda: begin(drive_run), lambda: drive_run.is_over, tls))
-    drive_run.thread.join()
+
+    async def conduct() -> None:
+        begin(drive_run)
+        await drive_run.wait()
+
+    asyncio.run(serve(Server(drive_run.drive, device, args.serve, tls), conduct))
     return drive_run
 
 

@@ -100,7 +100,8 @@ class DrivenTraining(Base):
     # Learning
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
-        self.learner.owe(gradient_steps)
+        if self.drive.learns:
+            self.learner.owe(gradient_steps)
         self.drive.lag = self.owed_steps
 
     def train_now(self, gradient_steps: int, batch_size: int) -> None:
@@ -135,11 +136,18 @@ class DrivenTraining(Base):
         with self._driving_lock:
             self._this_thread.acts = True
             try:
-                sampled = super()._sample_action(learning_starts, action_noise, n_envs)
+                starts = learning_starts if self.drive.learns else 0
+                sampled = super()._sample_action(starts, action_noise, n_envs)
                 self._tell(sampled[1])
             finally:
                 self._this_thread.acts = False
         return sampled
+
+    def predict(self, *args: Any, **kwargs: Any) -> Any:
+        """Predict as the algorithm does, but without exploration where nothing is learned."""
+        if not self.drive.learns:
+            kwargs["deterministic"] = True
+        return super().predict(*args, **kwargs)
 
     def _tell(self, actions: np.ndarray | None = None) -> None:
         """
@@ -148,7 +156,7 @@ class DrivenTraining(Base):
         :param actions: that it is about to do, scaled to [-1, 1], shape (1, 2)
         """
         choice = getattr(self.policy, "last_choice", None)
-        risk = self._meter.tell(None if actions is None else self._foreseen(actions))
+        risk = self._meter.tell(None if actions is None or not self.drive.meter else self._foreseen(actions))
         novice = Novice(
             self.stage_name,
             None if choice is None else bool(choice.self_drives[0]),
@@ -268,6 +276,8 @@ class DrivenStages(DrivenTraining):
 
     def _start_stage_2(self) -> None:
         """Prepare stage 2; called after each step of the environment as long as it is due."""
+        if not self.drive.learns:
+            return
         if self.prefit_left is None:
             self.steps_before_prefit, self.prefit_left = self.owed_steps, self.prefit_steps  # type: ignore[attr-defined]
             self.learner.owe(self.prefit_steps)  # type: ignore[attr-defined]
@@ -296,6 +306,8 @@ class DrivenRounds(DrivenTraining):
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
         assert isinstance(self, HGDagger)
+        if not self.drive.learns:
+            return
         if self._is_round_over() or self.num_timesteps >= self._total_timesteps:
             self.drive.busy = "The car waits: the novice is fitted to what you drove"
             try:

@@ -1,6 +1,7 @@
 """A drive from its beginning to its end: what runs in the driving thread."""
 
 import argparse
+import asyncio
 import contextlib
 import io
 import threading
@@ -16,7 +17,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from sb3_chac.cockpit.devices import Device
 from sb3_chac.cockpit.driven import DrivenTraining, driven
 from sb3_chac.cockpit.person import NotDrivable, Person, check_drivable
-from sb3_chac.cockpit.recording import CrashSafeRecorder, Summary
+from sb3_chac.cockpit.recording import CrashSafeRecorder, EpisodeRecord, Summary
 from sb3_chac.cockpit.session import Session
 from sb3_chac.cockpit.wrapper import Cockpit
 from sb3_chac.common.checkpoints import ResumableCheckpoint
@@ -92,12 +93,17 @@ class CockpitRun:
 
     :param args: of the command line, see ``sb3_chac.cli.drive``
     :param device: that the person holds
+    :param on_episode: called with each episode that has ended
     """
 
-    def __init__(self, args: argparse.Namespace, device: Device) -> None:
+    def __init__(
+        self, args: argparse.Namespace, device: Device, on_episode: Callable[[EpisodeRecord], None] | None = None
+    ) -> None:
         register()
         self.args = args
-        self.drive = Session(Person(device), args.rate or DEFAULT_RATE, args.query)
+        self.on_episode = on_episode
+        person = Person(device, not args.no_takeover)
+        self.drive = Session(person, args.rate or DEFAULT_RATE, args.query, not args.no_meter, not args.no_learning)
         self.summary: Summary | None = None
         self.run_folder: Path | None = None
         self.error: BaseException | None = None
@@ -108,6 +114,11 @@ class CockpitRun:
     def is_over(self) -> bool:
         """Tell whether the driving thread has ended."""
         return not self.thread.is_alive()
+
+    async def wait(self) -> None:
+        """Wait for the end of the driving thread, in an event loop."""
+        while not self.is_over:
+            await asyncio.sleep(0.1)
 
     def _run(self) -> None:
         try:
@@ -167,5 +178,6 @@ class CockpitRun:
         assert self.run_folder is not None
         watched = InterventionWrapper(env, expert=person, rule=person.drives)
         recorder = CrashSafeRecorder(self.run_folder, env, args.dataset, f"{args.algo} and a person", self.drive.period)
+        recorder.on_episode = self.on_episode
         self.cockpit = Cockpit(watched, self.drive, recorder)
         return self.cockpit

@@ -39,10 +39,11 @@ class Person:
     come from the thread of the window or the server, ``look`` from the one that drives.
 
     :param device: that the person holds
+    :param may_take_over: whether it may drive, or only watch
     """
 
-    def __init__(self, device: Device) -> None:
-        self.device = device
+    def __init__(self, device: Device, may_take_over: bool = True) -> None:
+        self.device, self.may_take_over = device, may_take_over
         self.lock = threading.Lock()  # held while the device is used
         self.input = DriverInput(0.0, 0.0, False, True)  # of the present step
         self.sit_in(spaces.Box(-1.0, 1.0, (2,)))
@@ -74,7 +75,8 @@ class Person:
     def read(self) -> DriverInput:
         """Return what the person wants now."""
         with self.lock:
-            return self.device.read()
+            now = self.device.read()
+        return now if self.may_take_over else now._replace(takeover=False)
 
     def hand_back(self) -> None:
         """End the takeover, if there is one."""

@@ -2,9 +2,10 @@
 
 import json
 import shutil
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -69,6 +70,20 @@ class Summary:
         return "\n".join(lines)
 
 
+class EpisodeRecord(NamedTuple):
+    """Record of one episode; None stands for what the environment does not tell."""
+
+    steps: int
+    human_steps: int
+    takeovers: int
+    cost: float | None
+    human_cost: float
+    success: bool | None
+    episode_return: float
+    seconds: float  # of driving
+    is_whole: bool  # False if it was cut off: the person quit, or nobody was at the wheel
+
+
 class CrashSafeRecorder:
     """
     Recorder that writes each episode into a file of its own once it ends; ``finish`` makes the dataset of them. What a process
@@ -102,6 +117,8 @@ class CrashSafeRecorder:
         }
         write_safely(self.folder / ABOUT, json.dumps(about).encode())
         self.number = 0
+        self.on_episode: Callable[[EpisodeRecord], None] | None = None  # called when one is on the disk
+        self.seconds_per_step = seconds_per_step
         self._steps: list[dict[str, Any]] = []
 
     def begin(self, observation: np.ndarray, seed: int, options: dict[str, Any] | None) -> None:
@@ -142,6 +159,7 @@ class CrashSafeRecorder:
         steps, self._steps = self._steps, []
         if not steps:
             return
+        is_whole = bool(steps[-1]["termination"] or steps[-1]["truncation"])
         steps[-1]["truncation"] = steps[-1]["truncation"] or not steps[-1]["termination"]
         columns = {name: np.array([step[name] for step in steps]) for name in steps[0]}
         columns["observation"] = np.concatenate([self._first[None], columns["observation"]])
@@ -152,6 +170,8 @@ class CrashSafeRecorder:
         sync(temporary)
         temporary.rename(file)
         self.number += 1
+        if self.on_episode is not None:
+            self.on_episode(_record(columns, self.seconds_per_step, is_whole))
 
     def finish(self) -> Summary:
         """
@@ -230,6 +250,21 @@ def _episode(columns: dict[str, np.ndarray]) -> "EpisodeBuffer":
         truncations=columns["truncation"].tolist(),
         # The first entries belong to the reset
         infos={name: np.concatenate([np.zeros_like(values[:1]), values]) for name, values in infos.items()},
+    )
+
+
+def _record(columns: dict[str, np.ndarray], seconds_per_step: float, is_whole: bool) -> EpisodeRecord:
+    one = _summary([columns], None, seconds_per_step)
+    return EpisodeRecord(
+        one.steps,
+        one.human_steps,
+        one.takeovers,
+        one.cost,
+        one.human_cost,
+        None if one.successes is None else bool(one.successes),
+        float(columns["reward"].sum()),
+        one.seconds,
+        is_whole,
     )
 
 

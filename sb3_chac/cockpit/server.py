@@ -10,8 +10,9 @@ import signal
 import ssl
 import sys
 import time
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager, suppress
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,8 @@ from sb3_chac.cockpit.access import MOST_CONNECTIONS, Access, Counter
 from sb3_chac.cockpit.address import Address
 from sb3_chac.cockpit.devices import Clock
 from sb3_chac.cockpit.devices.browser import BadMessage, Browser, Held, Wish, parse
-from sb3_chac.cockpit.session import Session, asks_for_help, indicators, who_drives
+from sb3_chac.cockpit.forms import Answer, Form
+from sb3_chac.cockpit.session import Session, SessionEnded, asks_for_help, indicators, who_drives
 from sb3_chac.deploy.address import remedy
 
 STATIC = Path(__file__).parent / "static"
@@ -36,6 +38,7 @@ FILES = {"/": "index.html", "/cockpit.js": "cockpit.js", "/cockpit.css": "cockpi
 MOST_BYTES = 1024  # of a message
 MOST_MESSAGES = 200  # of a viewer in a second, control frames included
 MOST_VIEWERS = 16
+MOST_BYTES_OF_ANSWER = 2**16
 HEARTBEAT = 5.0  # [s] between two questions whether a viewer is still there
 LOOK, TELL = 0.01, 0.05  # [s] between two looks for a new picture, and between two messages to a viewer at most
 
@@ -80,6 +83,11 @@ class Server:
         self.access = Access(address, tls, clock)
         self.viewers: list[Viewer] = []
         self.driver: Viewer | None = None
+        self.form: Form | None = None  # that the driver is asked to fill in
+        self.form_number = 0
+        self._answer: asyncio.Future[Answer]
+        self.has_quit = False
+        self.farewell = "The drive is over"
         self._picture: tuple[int, bytes] = (-1, b"")
         self._news = asyncio.Event()
 
@@ -91,8 +99,9 @@ class Server:
         :raises OSError: if the address cannot be had
         """
         access = self.access
-        app = web.Application(middlewares=[access.guard])
+        app = web.Application(middlewares=[access.guard], client_max_size=MOST_BYTES_OF_ANSWER)
         app.add_routes([web.get(path, self._file) for path in FILES] + [web.get("/ws", self._websocket)])
+        app.add_routes([web.get("/form", self._show_form), web.post("/form", self._take_answer)])
         runner = web.AppRunner(app, access_log=None, keepalive_timeout=access.patience, shutdown_timeout=1.0)
         await runner.setup()
         http, loop = runner.server, asyncio.get_running_loop()
@@ -118,7 +127,7 @@ class Server:
             listener.close()
             for viewer in list(self.viewers):
                 with suppress(ConnectionError, asyncio.TimeoutError):
-                    await asyncio.wait_for(viewer.socket.close(code=WSCloseCode.GOING_AWAY, message=b"The drive is over"), 1)
+                    await asyncio.wait_for(viewer.socket.close(code=WSCloseCode.GOING_AWAY, message=self.farewell.encode()), 1)
             await runner.cleanup()
 
     async def _file(self, request: web.Request) -> web.StreamResponse:
@@ -158,6 +167,59 @@ class Server:
                 with self.drive.person.lock:
                     self.device.leave()
         return channel
+
+    # What they are asked
+
+    async def ask(self, form: Form) -> Answer:
+        """
+        Ask the driver to fill in a form.
+
+        :param form: is shown until it is answered
+        :raises SessionEnded: if the server is to end
+        """
+        if self.has_quit:
+            raise SessionEnded
+        self._answer = asyncio.get_running_loop().create_future()
+        self.form, self.form_number = form, self.form_number + 1
+        try:
+            return await self._answer
+        finally:
+            self.form = None
+            self._news.set()
+
+    def quit(self) -> None:
+        """End the drive and what is asked."""
+        self.has_quit = True
+        self.drive.quit()
+        if self.form is not None and not self._answer.done():
+            self._answer.set_exception(SessionEnded())
+
+    def _asked_form(self, request: web.Request) -> Form:
+        """
+        Return the form, to who may drive.
+
+        :raises HTTPException: for others, and if none is asked
+        """
+        if not self.access.may_drive(request):
+            raise web.HTTPForbidden(text="Who watches is not asked.")
+        if self.form is None or self._answer.done():
+            raise web.HTTPNotFound(text="Nothing is asked now.")
+        return self.form
+
+    async def _show_form(self, request: web.Request) -> web.StreamResponse:
+        form = self._asked_form(request)
+        return web.json_response({"number": self.form_number, **asdict(form)})
+
+    async def _take_answer(self, request: web.Request) -> web.StreamResponse:
+        self.access.check_origin(request)
+        text = await request.text()
+        form = self._asked_form(request)
+        try:
+            answer = form.parse(text, self.form_number)
+        except BadMessage as error:
+            raise web.HTTPBadRequest(text=str(error)) from error
+        self._answer.set_result(answer)
+        return web.Response(text="")
 
     def _sit_down(self, viewer: Viewer) -> None:
         """Take the wheel if it is free. A takeover in progress is never transferred: the vehicle brakes first."""
@@ -242,6 +304,8 @@ class Server:
             role = "free" if self.driver is None else "taken"
         return {
             "role": role,
+            "form": self.form_number if self.form is not None and role == "driver" else None,
+            "may_take_over": drive.person.may_take_over,
             "notice": drive.notice,
             "waits": bool(drive.paused or drive.busy or drive.ended),
             "paused": drive.paused,
@@ -298,34 +362,22 @@ def tls_context(certificate: Path, key: Path | None) -> ssl.SSLContext:
     return context
 
 
-async def serve(
-    drive: Session,
-    device: Browser,
-    address: Address,
-    begin: Callable[[], None],
-    is_over: Callable[[], bool],
-    tls: ssl.SSLContext | None = None,
-) -> None:
+async def serve(server: Server, conduct: Callable[[], Awaitable[None]]) -> None:
     """
-    Serve the cockpit until the drive is over. SIGINT and SIGTERM end it as the person's quit does.
+    Serve the cockpit until what it is for is over. SIGINT and SIGTERM end it as the person's quit does.
 
-    :param drive: with ``device`` at its wheel
-    :param device: of the driver
-    :param address: where
-    :param begin: called as soon as it is served
-    :param is_over: asked from then on
-    :param tls: certificate and key, None to encrypt nothing
+    :param server: not listening yet
+    :param conduct: what it is for, runs as soon as it is served
     :raises OSError: if the address cannot be had
     """
-    server = Server(drive, device, address, tls)
     access = server.access
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
-        loop.add_signal_handler(number, drive.quit)
+        loop.add_signal_handler(number, server.quit)
     async with server.listening():
         if not access.address.is_loopback and tls is None:
             print(
-                f"Warning: {address.host} can be reached from other machines, and nothing is encrypted. Safer: --tls-cert, or "
+                f"Warning: {access.address.host} can be reached from other machines, and nothing is encrypted. Safer: --tls-cert, or "
                 f"--serve 127.0.0.1:{access.address.port}, and on your machine ssh -L {access.address.port}:127.0.0.1:"
                 f"{access.address.port} HERE.",
                 file=sys.stderr,
@@ -334,6 +386,4 @@ async def serve(
         print(f"Watch at  {access.url(access.spectator_token)}", flush=True)
         if not access.address.is_loopback and sys.stdout.isatty():
             print("Drive with a phone in this network:\n" + qr_code(access.url(access.driver_token)), flush=True)
-        begin()
-        while not is_over():
-            await asyncio.sleep(0.1)
+        await conduct()

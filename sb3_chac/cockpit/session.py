@@ -96,11 +96,15 @@ class Session:
     :param person: at the wheel
     :param rate: [1/s] steps in real time, at most
     :param query: risk from which the novice asks for help, see ``GuidanceMeter``; None never to ask
+    :param meter: whether the guidance meter is shown
+    :param learns: whether the novice learns from what is driven
     """
 
-    def __init__(self, person: Person, rate: float = 10.0, query: float | None = None) -> None:
+    def __init__(
+        self, person: Person, rate: float = 10.0, query: float | None = None, meter: bool = True, learns: bool = True
+    ) -> None:
         self.person = person
-        self.query = query
+        self.query, self.meter, self.learns = query, meter, learns
         self.period = 1 / rate
         self.display = Display()  # replaced as a whole, as are the totals
         self.totals = Totals()

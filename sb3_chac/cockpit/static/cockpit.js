@@ -164,7 +164,7 @@ function isForButton(event) {
 }
 
 addEventListener("keydown", (event) => {
-  if (event.ctrlKey || event.altKey || event.metaKey || isForButton(event)) return;
+  if (byId("form").open || event.ctrlKey || event.altKey || event.metaKey || isForButton(event)) return;
   if (event.code in KEYS) {
     held.set(event.code, KEYS[event.code]);
     if (!event.repeat) tellHeld();
@@ -348,8 +348,93 @@ function showCollisions(number) {
   collisions = number;
 }
 
+// Forms that the server asks to fill in
+
+let formNumber = null; // of the form that is asked
+let shownNumber = null; // of the form that is in the dialog
+
+function element(name, properties = {}, ...children) {
+  const made = Object.assign(document.createElement(name), properties);
+  made.append(...children);
+  return made;
+}
+
+/** A scale has no value until the person has chosen one. */
+function makeScale(question) {
+  const input = element("input", { type: "range", min: 0, max: 100, step: 5, value: 50, name: question.name });
+  const value = element("output", { textContent: "not chosen" });
+  const [low, high] = question.ends;
+  const choose = () => {
+    input.dataset.chosen = "true";
+    value.textContent = input.value;
+    input.setAttribute("aria-valuetext", `${input.value} from ${low} to ${high}`);
+  };
+  input.setAttribute("aria-valuetext", "not chosen");
+  for (const kind of ["input", "click"]) input.addEventListener(kind, choose);
+  input.addEventListener("keydown", ({ code }) => { if (code === "Space" || code === "Enter") choose(); });
+  const ends = element("span", { className: "ends" }, element("span", { textContent: low }), value, element("span", { textContent: high }));
+  return element("label", { className: "question" }, element("span", { textContent: question.text }), input, ends);
+}
+
+function makeText(question) {
+  const input = element("textarea", { name: question.name, rows: 3, maxLength: 4000 });
+  return element("label", { className: "question" }, element("span", { textContent: question.text }), input);
+}
+
+async function answer(form, choice) {
+  const fields = [...byId("form").querySelectorAll("input, textarea")];
+  const missing = fields.find((field) => field.type === "range" && !field.dataset.chosen);
+  const problem = byId("form").querySelector(".problem");
+  if (missing) {
+    problem.textContent = "Choose a place on each scale";
+    missing.focus();
+    return;
+  }
+  const values = Object.fromEntries(fields.map((field) => [field.name, field.type === "range" ? Number(field.value) : field.value]));
+  const body = JSON.stringify({ form: form.number, choice, values });
+  const response = await fetch(`/form${location.search}`, { method: "POST", body }).catch(() => null);
+  problem.textContent = response?.ok ? "" : `Not stored${response ? `: ${await response.text()}` : ""}. Try again`;
+}
+
+async function showForm(number) {
+  const dialog = byId("form");
+  if (number === formNumber) {
+    if (number !== null && number === shownNumber && !dialog.open) dialog.showModal(); // Escape does not end it
+    return;
+  }
+  formNumber = number;
+  dialog.close();
+  if (number === null) return;
+  const response = await fetch(`/form${location.search}`).catch(() => null);
+  if (!response?.ok) {
+    formNumber = null; // asked for again with the next state
+    return;
+  }
+  const form = await response.json();
+  if (form.number !== formNumber) return;
+  leave();
+  for (const other of document.querySelectorAll("dialog[open]")) other.close();
+  byId("form-title").textContent = form.title;
+  const questions = form.questions.map((question) => (question.ends ? makeScale(question) : makeText(question)));
+  const buttons = form.choices.map((choice) => {
+    const button = element("button", { type: "button", textContent: choice });
+    button.addEventListener("click", () => answer(form, choice));
+    return button;
+  });
+  const text = element("p", { className: "reading", textContent: form.text });
+  const problem = element("p", { className: "problem" });
+  problem.setAttribute("role", "alert");
+  shownNumber = number;
+  byId("fields").replaceChildren(text, ...questions, problem, ...buttons);
+  dialog.showModal();
+  dialog.scrollTop = 0;
+}
+
+byId("form").addEventListener("cancel", (event) => event.preventDefault());
+
 function show(state) {
   role = state.role;
+  showForm(state.form);
   document.body.dataset.driver = state.driver;
   const told = state.driver === "person" && role === "driver" ? "You drive" : DRIVERS[state.driver];
   setText(byId("told"), state.asks ? "The novice asks for help" : told);
@@ -368,7 +453,9 @@ function show(state) {
   showQuery(state.asks);
   for (const name of Object.keys(bars)) bars[name].forEach((set, i) => set(state[name][i]));
   for (const button of document.querySelectorAll("[data-wish]")) button.disabled = role !== "driver";
-  for (const name in touched) byId(name).classList.toggle("off", role !== "driver");
+  const mayDrive = role === "driver" && state.may_take_over;
+  document.querySelector("[data-wish=takeover]").disabled = !mayDrive;
+  for (const name in touched) byId(name).classList.toggle("off", !mayDrive);
   setText(document.querySelector("[data-wish=takeover]"), state.wants ? "Hand back" : "Take over");
   setText(document.querySelector("[data-wish=pause]"), state.paused ? "Begin" : "Pause");
   showCollisions(state.collisions);
@@ -396,10 +483,12 @@ socket.addEventListener("message", ({ data }) => {
     byId("connection").textContent = `round trip ${roundTrip.toFixed(0)} ms`;
   } else show(message);
 });
-socket.addEventListener("close", ({ reason }) => {
+socket.addEventListener("close", ({ code, reason }) => {
+  showForm(null);
   role = "";
   document.body.dataset.driver = "unknown";
   byId("notice").hidden = false;
-  byId("notice").textContent = `Not connected${reason ? `: ${reason}` : ""}. Reload the page to connect again`;
+  const lost = `Not connected${reason ? `: ${reason}` : ""}. Reload the page to connect again`;
+  byId("notice").textContent = code === 1001 && reason ? reason : lost; // it went away in good order
   byId("connection").textContent = "";
 });
