@@ -63,6 +63,7 @@ class Served:
             pass
 
     async def serve(self):
+        self.loop = asyncio.get_running_loop()
         async with self.server.listening():
             self.is_served.set()
             while not self.drive.ended:

@@ -1,4 +1,4 @@
-"""Studies: protocol, orders, what is stored, resuming, the summary; a scripted participant through the real command; the page."""
+"""Studies: protocol, orders, what is stored, the summary; a scripted participant with the real command; the page."""
 
 import asyncio
 import csv
@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 from collections import Counter
+from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
 
@@ -16,18 +17,19 @@ import aiohttp
 import pytest
 import yaml
 from shell import FOREVER, wait_until
-from test_cockpit_browser import Driver, closed, state_of, status
-from test_cockpit_page import chromium, needs_chromium, opened, served  # noqa: F401
+from test_cockpit_browser import Driver, state_of, status
+from test_cockpit_page import LOOKED_AT, chromium, needs_chromium, opened, served  # noqa: F401
 
 from sb3_chac.__main__ import main
 from sb3_chac.cli.drive import prepare
 from sb3_chac.cockpit import forms
 from sb3_chac.cockpit.devices.browser import BadMessage
 from sb3_chac.cockpit.recording import EpisodeRecord
+from sb3_chac.cockpit.session import SessionEnded
 from sb3_chac.cockpit.study import SUMMARY, Condition, Participant, Protocol, StudyError, read_protocol, summarise, table
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "study" / "protocol.yaml"
-SHORT = {"episodes": 2, "algo": "pvp", "env_kwargs": {"horizon": 12, "blocks": 1}, "rate": 50}
+SHORT = {"episodes": 2, "algo": "pvp", "env_kwargs": {"horizon": 30, "blocks": 1}, "rate": 20}
 RECORD = EpisodeRecord(100, 10, 2, 1.5, 0.5, True, 50.0, 10.0, True)
 SCALES = {scale.name: 5 * i for i, scale in enumerate(forms.TLX)}
 
@@ -191,12 +193,116 @@ def test_answers_to_forms():
             form.parse(text, 3)
 
 
+# The page
+
+
+@contextmanager
+def asked(drive, form):
+    """Ask inside the block; what it gives tells the answer."""
+    future = asyncio.run_coroutine_threadsafe(drive.server.ask(form), drive.loop)
+    yield future
+    assert drive.server.form is None or future.cancel()
+
+
+def test_who_may_read_and_answer_a_form(served):  # noqa: F811
+    access = served.server.access
+
+    async def post(token, text, origin=None):
+        headers = {"Origin": origin or served.origin}
+        async with aiohttp.ClientSession() as session:
+            async with session.post(f"{served.origin}/form?token={token}", data=text, headers=headers) as response:
+                return response.status
+
+    async def come():
+        driver, watcher = access.driver_token, access.spectator_token
+        assert (await status(served, f"/form?token={driver}"))[0] == 404
+        with asked(served, forms.consent_form("T", "<b>Do you?</b>")) as future:
+            await asyncio.to_thread(wait_until, lambda: served.server.form)
+            for token in ("x", watcher):
+                assert (await status(served, f"/form?token={token}"))[0] == await post(token, "{}") == 403
+            text = (await status(served, f"/form?token={driver}"))[1]
+            assert json.loads(text)["choices"] == [forms.AGREE, forms.DECLINE]
+            yes = json.dumps({"form": 1, "choice": forms.AGREE, "values": {}})
+            assert await post(driver, yes, "http://evil.example") == 403
+            assert await post(driver, "{") == 400 and await post(driver, "x" * 2**17) == 413
+            async with served.viewer() as channel, served.viewer() as second:
+                assert (await state_of(channel, lambda state: "role" in state))["form"] == 1
+                assert (await state_of(second, lambda state: state.get("role") == "taken"))["form"] is None
+            assert await post(driver, yes) == 200
+            assert future.result(FOREVER) == (forms.AGREE, {}) and await post(driver, yes) == 404
+
+    asyncio.run(come())
+
+
+def test_a_server_that_is_to_end_asks_nothing_more(served):  # noqa: F811
+    form = forms.consent_form("T", "?")
+    future = asyncio.run_coroutine_threadsafe(served.server.ask(form), served.loop)
+    wait_until(lambda: served.server.form)
+    served.loop.call_soon_threadsafe(served.server.quit)
+    with pytest.raises(SessionEnded):
+        future.result(FOREVER)
+
+
+@needs_chromium
+def test_forms_are_filled_in_with_the_keyboard_and_read_on_a_phone(served):  # noqa: F811
+    sizes = {"viewport": {"width": 390, "height": 844}, "has_touch": True}
+    with chromium() as browser, opened(browser, served, **sizes) as page:
+        with asked(served, forms.consent_form("A study", "Two\nlines, <b>no</b> markup\n" + 80 * "long\n")) as future:
+            page.wait_for_selector("#form[open]")
+            assert "<b>no</b> markup" in page.inner_text("#form .reading")
+            page.keyboard.press("Escape")
+            page.keyboard.press("Escape")
+            page.wait_for_selector("#form[open]")
+            look(page, "consent")
+            page.click(f"#form button:text-is('{forms.AGREE}')")
+            assert future.result(FOREVER).choice == forms.AGREE
+        with asked(served, forms.questionnaire("Part 1 of 2", ["When did you take over?"])) as future:
+            page.wait_for_selector("#form input[name=mental]")
+            page.click("#form button")
+            assert page.inner_text("#form .problem") == "Choose a place on each scale" and not future.done()
+            for presses in range(1, 7):  # the first scale has the keyboard already
+                for _ in range(presses):
+                    page.keyboard.press("ArrowRight")
+                page.keyboard.press("Tab")
+            page.keyboard.type("at p, q and h")  # keys of the cockpit are text here
+            look(page, "questions")
+            page.keyboard.press("Tab")
+            page.keyboard.press("Enter")
+            values = future.result(FOREVER).values
+        assert values == dict(zip(SCALES, range(55, 81, 5), strict=True)) | {"When did you take over?": "at p, q and h"}
+        page.wait_for_selector("#form", state="hidden")
+        assert served.drive.paused and not served.drive.ended and not served.drive.person.read().takeover
+
+
+def look(page, name):
+    """Nothing is cut off, axe finds nothing, and those who want to look get a picture."""
+    box = page.locator("#form").bounding_box()
+    assert box["x"] >= 0 and box["y"] >= 0 and box["width"] <= 390 and box["height"] <= 844
+    assert page.evaluate("document.getElementById('form').scrollWidth <= document.getElementById('form').clientWidth")
+    axe = pytest.importorskip("axe_playwright_python.sync_playwright").Axe()
+    found = axe.run(page).response["violations"]
+    assert [(rule["id"], node["html"]) for rule in found for node in rule["nodes"]] == []
+    if LOOKED_AT:
+        page.screenshot(path=Path(LOOKED_AT) / f"study-{name}.png")
+
+
+@needs_chromium
+def test_who_may_only_watch_has_no_takeover(served):  # noqa: F811
+    served.drive.person.may_take_over = False
+    with chromium() as browser, opened(browser, served) as page:
+        page.wait_for_selector("[data-wish=takeover]:disabled")
+        page.keyboard.press("KeyP")
+        page.keyboard.down("ArrowUp")
+        wait_until(lambda: served.tick() or served.steps > 5)
+        assert not served.drive.person.read().takeover and served.car.executed[-1][1] == 0
+
+
 # A scripted participant and the command
 
 
 class ScriptedParticipant:
     """
-    Participant that answers each form, begins each drive and keeps the throttle down.
+    Participant that answers each form, begins each drive and takes over whenever the novice drives.
 
     :param url: that the command has printed
     :param leave_after: forms until which it takes part
@@ -210,16 +316,19 @@ class ScriptedParticipant:
     async def take_part(self):
         async with aiohttp.ClientSession(headers={"Origin": self.page}) as self.session:
             async with self.session.ws_connect(f"{self.page}/ws?token={self.token}", max_msg_size=0) as channel:
-                driver = Driver(channel)
-                driver.keys = ["up"]
-                task = asyncio.create_task(driver.tell())
-                with pytest.raises((AssertionError, TypeError)):  # the channel is closed
-                    while len(self.seen) < self.leave_after:
-                        await self.go_on(channel, await state_of(channel, lambda state: "role" in state))
+                self.driver = Driver(channel)
+                task = asyncio.create_task(self.driver.tell())
+                async for message in channel:
+                    if message.type is aiohttp.WSMsgType.TEXT and "role" in (state := json.loads(message.data)):
+                        await self.go_on(channel, state)
+                    if len(self.seen) == self.leave_after:
+                        break
                 task.cancel()
 
     async def go_on(self, channel, state):
         self.notices.add(state["notice"])
+        if not state["wants"]:  # a key that is pressed anew takes over
+            self.driver.keys = [] if self.driver.keys else ["up"]
         if state["form"] is not None and state["form"] not in [form["number"] for form in self.seen]:
             form = await self.ask()
             self.seen.append(form)
@@ -227,7 +336,7 @@ class ScriptedParticipant:
             answer = {"form": form["number"], "choice": self.choose(form), "values": values}
             async with self.session.post(f"{self.page}/form?token={self.token}", json=answer) as response:
                 assert response.status == 200
-        elif state["paused"] and state["form"] is None and len(self.seen):
+        elif state["form"] is None and re.search("P (begins|goes on)", state["notice"]):
             await channel.send_json({"wish": "pause"})
             await asyncio.sleep(0.1)
 
@@ -291,7 +400,7 @@ def test_in_the_middle_of_a_condition_the_novice_goes_on_with_what_it_has_learne
     _, printed, code = study(tmp_path, Leaving)
     done = len(Participant(tmp_path / "out", 1).episodes("a"))
     assert code == 0 and "Go on with:  sb3-chac study protocol.yaml --out out --participant 1" in printed and 1 <= done < 3
-    person, printed, _ = study(tmp_path)
+    _, printed, _ = study(tmp_path)
     assert "has finished" in printed and len(Participant(tmp_path / "out", 1).episodes("a")) == 3
     assert [run.name for run in sorted((folder / "a" / "pvp").iterdir())] == ["SafeDrive-v0_1", "SafeDrive-v0_2"]
 

@@ -184,16 +184,20 @@ def without(option: str, arguments: list[str]) -> list[str]:
     return kept
 
 
-def check_numbers(args: argparse.Namespace) -> None:
+def check_given(args: argparse.Namespace) -> None:
     """
-    Check numbers for which nothing is filled in.
+    Check arguments for which nothing is filled in.
 
-    :raises NotDrivable: for numbers out of their range
+    :raises NotDrivable: for numbers out of their range, and for what does not go together
     """
     if args.rate is not None and not 0.5 <= args.rate <= 100:
         raise NotDrivable(f"--rate must be from 0.5 to 100 steps per second, got {args.rate:g}.")
     if args.query is not None and not 0 < args.query <= 1:
         raise NotDrivable(f"--query must be above 0 and at most 1 (for example 0.95), got {args.query:g}.")
+    if args.no_learning and not args.trained_agent:
+        raise NotDrivable("--no-learning needs a model that can drive: -i MODEL.zip.")
+    if args.query is not None and (args.no_meter or args.no_takeover):
+        raise NotDrivable("--query asks for help by the meter: leave out --no-meter and --no-takeover.")
 
 
 def check_arguments(args: argparse.Namespace) -> None:
@@ -220,13 +224,9 @@ def check_arguments(args: argparse.Namespace) -> None:
             raise NotDrivable(f"--{option.replace('_', '-')} must be at least {low}, got {getattr(args, option)}.")
     if args.trained_agent and not Path(args.trained_agent).is_file():
         raise NotDrivable(f"--trained-agent: there is no file {args.trained_agent}.")
-    if args.no_learning and not args.trained_agent:
-        raise NotDrivable("--no-learning needs a model that can drive: -i MODEL.zip.")
-    if args.query is not None and (args.no_meter or args.no_takeover):
-        raise NotDrivable("--query asks for help by the meter: leave out --no-meter and --no-takeover.")
     if args.pretrain and not args.demos:
         raise NotDrivable("--pretrain needs --demos: there is nothing to learn from before the drive.")
-    check_numbers(args)
+    check_given(args)
     if args.serve and (args.device != "auto" or args.config):
         raise NotDrivable("--serve is driven with the browser's devices: leave out --device and --config.")
     if (args.tls_cert or args.tls_key) and not (args.serve and args.tls_cert):

@@ -15,7 +15,7 @@ from sb3_chac.cockpit.address import parse_address
 from sb3_chac.cockpit.person import NotDrivable, Person
 from sb3_chac.cockpit.session import Session, SessionEnded
 
-DESCRIPTION = """Run a study in the browser: consent, practice, conditions in an order of their own for each participant, NASA-TLX.
+DESCRIPTION = """Run a study in the browser: consent, practice, the conditions in each participant's order, NASA-TLX.
 
   sb3-chac study protocol.yaml --out study --participant 1     begins, or goes on after an interruption
   sb3-chac study study --summary                               all participants: a table, and study/summary.csv
@@ -33,7 +33,9 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument("--summary", action="store_true", help="sum up all participants")
     parser.add_argument("--out", type=Path, metavar="FOLDER", help="of the study")
     parser.add_argument("--participant", type=int, metavar="N", help="number, at least 1 (default: the first that is free)")
-    parser.add_argument("--serve", default="8000", metavar="[HOST:]PORT", help="where the page is served (default: %(default)s)")
+    parser.add_argument(
+        "--serve", default="8000", metavar="[HOST:]PORT", help="where the page is served (default: %(default)s)"
+    )
     parser.add_argument("--tls-cert", type=Path, metavar="FILE", help="encrypt with this certificate (PEM)")
     parser.add_argument("--tls-key", type=Path, metavar="FILE", help="its key (PEM), if that is in another file")
     return parser
@@ -132,7 +134,7 @@ class Study:
 
         tls = tls_context(args.tls_cert, args.tls_key) if args.tls_cert else None
         idle = Session(Person(self.device))
-        idle.message = ""
+        idle.busy = "One moment"  # until the first drive
         self.server = Server(idle, self.device, parse_address(args.serve), tls)
         asyncio.run(serve(self.server, self._conduct))
 
@@ -214,7 +216,9 @@ class Study:
         arguments = condition.drive_arguments(folder, self.protocol.folder, dataset, int(seed))
         if runs and done and condition.learn:
             try:
-                return drive_command.prepare(["--resume", f"{runs[-1]}", "--dataset", f"{folder / dataset}", "--seed", f"{seed}"])
+                return drive_command.prepare(
+                    ["--resume", f"{runs[-1]}", "--dataset", f"{folder / dataset}", "--seed", f"{seed}"]
+                )
             except NotDrivable as error:
                 raise StudyError(
                     f"{runs[-1]}: what the novice had learned cannot be found: begin anew with another --participant. {error}"

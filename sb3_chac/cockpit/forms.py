@@ -68,7 +68,9 @@ class Form:
                     raise BadMessage("that form is not asked any more")
                 if choice not in self.choices or set(values) != {question.name for question in self.questions}:
                     raise BadMessage("unknown choice or question, or one without an answer")
-                return Answer(choice, {question.name: _checked(question, values[question.name]) for question in self.questions})
+                return Answer(
+                    choice, {question.name: _checked(question, values[question.name]) for question in self.questions}
+                )
         raise BadMessage("unknown answer")
 
 

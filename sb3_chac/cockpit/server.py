@@ -370,14 +370,14 @@ async def serve(server: Server, conduct: Callable[[], Awaitable[None]]) -> None:
     :param conduct: what it is for, runs as soon as it is served
     :raises OSError: if the address cannot be had
     """
-    access = server.access
+    access, address = server.access, server.access.address
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, server.quit)
     async with server.listening():
-        if not access.address.is_loopback and tls is None:
+        if not access.address.is_loopback and access.tls is None:
             print(
-                f"Warning: {access.address.host} can be reached from other machines, and nothing is encrypted. Safer: --tls-cert, or "
+                f"Warning: {address.host} can be reached from other machines, and nothing is encrypted. Safer: --tls-cert, or "
                 f"--serve 127.0.0.1:{access.address.port}, and on your machine ssh -L {access.address.port}:127.0.0.1:"
                 f"{access.address.port} HERE.",
                 file=sys.stderr,

@@ -196,7 +196,9 @@ def read_protocol(file: Path) -> Protocol:
     try:
         consent_text = (file.parent / data["consent"]).read_text(encoding="utf-8")
     except (OSError, UnicodeError) as error:
-        raise StudyError(f"{file}: consent: {file.parent / data['consent']} cannot be read: write what is agreed to.") from error
+        raise StudyError(
+            f"{file}: consent: {file.parent / data['consent']} cannot be read: write what is agreed to."
+        ) from error
     return Protocol(**data, text=text, consent_text=consent_text, folder=file.parent.resolve())
 
 
