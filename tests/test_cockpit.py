@@ -12,7 +12,7 @@ import numpy as np
 import pygame
 import pytest
 from cockpit_toys import Car, cockpit
-from guided_toys import make_guided
+from guided_toys import make_guided, parameters
 from gymnasium import spaces
 from shell import FOREVER, wait_until
 from stable_baselines3.common.vec_env import DummyVecEnv
@@ -325,6 +325,40 @@ def test_as_many_updates_as_the_algorithm_makes(algorithm, tmp_path):
     env.recorder.finish()
 
 
+@pytest.mark.parametrize("algorithm", [PVP, DPVP, CHAC])
+def test_a_novice_that_is_not_to_learn_stays_as_it_is_and_does_not_explore(algorithm, tmp_path):
+    model, drive, env = make_driven(algorithm, tmp_path, learning_starts=10**6)
+    drive.learns = False
+    before = parameters(model)
+    model.learn(40)
+    assert model._n_updates == model.owed_steps == 0
+    assert all((value == before[name]).all() for name, value in model.policy.state_dict().items())
+    executed = env.unwrapped.executed
+    proposed = [model.predict(np.array([3.0, step], np.float32), deterministic=True)[0] for step in range(2)]
+    assert np.allclose(executed[0], proposed[0]) and len(executed) == 40
+    env.recorder.finish()
+
+
+@pytest.mark.parametrize("meter", [True, False])
+def test_the_meter_can_be_left_out(meter, tmp_path):
+    model, drive, env = make_driven(PVP, tmp_path)
+    drive.meter = meter
+    model.learn(120)
+    assert (drive.display.novice.risk is not None) == meter
+    env.recorder.finish()
+
+
+def test_who_may_only_watch_never_drives(tmp_path):
+    _, device, emulator = keyboard()
+    env, drive, car = cockpit(tmp_path, device)
+    drive.person.may_take_over = False
+    env.env.arm()
+    env.reset(seed=1)
+    emulator.press(pygame.K_UP)
+    _, _, _, _, info = env.step(np.array([0.25, 0.0], np.float32))
+    assert not info["takeover"] and np.allclose(car.executed[-1], [0.25, 0.0])
+
+
 def test_slow_updates_do_not_hold_up_the_drive(tmp_path):
     model, drive, _ = make_driven(DPVP, tmp_path, rate=50.0)
     train_now, begun_at = model.train_now, []
@@ -525,6 +559,8 @@ def main_with(monkeypatch, *arguments):
         (["--pretrain", "5"], "--pretrain needs --demos"),
         (["--rate", "0"], "--rate must be from"),
         (["--query", "1.5"], "--query must be above 0"),
+        (["--query", "0.9", "--no-meter"], "leave out --no-meter"),
+        (["--no-learning"], "--no-learning needs a model"),
         (["--config", "nothing.yml"], "nothing.yml cannot be read"),
         (["--resume", "nowhere"], "there is no such folder"),
         (["--recover", "nowhere"], "holds no recording"),

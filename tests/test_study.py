@@ -20,6 +20,7 @@ from shell import FOREVER, wait_until
 from test_cockpit_browser import Driver, state_of, status
 from test_cockpit_page import LOOKED_AT, chromium, needs_chromium, opened, served  # noqa: F401
 
+import sb3_chac
 from sb3_chac.__main__ import main
 from sb3_chac.cli.drive import prepare
 from sb3_chac.cockpit import forms
@@ -29,6 +30,7 @@ from sb3_chac.cockpit.session import SessionEnded
 from sb3_chac.cockpit.study import SUMMARY, Condition, Participant, Protocol, StudyError, read_protocol, summarise, table
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "study" / "protocol.yaml"
+GUIDE = Path(sb3_chac.__file__).parent / "cockpit" / "README.md"
 SHORT = {"episodes": 2, "algo": "pvp", "env_kwargs": {"horizon": 30, "blocks": 1}, "rate": 20}
 RECORD = EpisodeRecord(100, 10, 2, 1.5, 0.5, True, 50.0, 10.0, True)
 SCALES = {scale.name: 5 * i for i, scale in enumerate(forms.TLX)}
@@ -52,6 +54,7 @@ def protocol(size=3, **changes):
 
 def test_the_example(tmp_path, monkeypatch):
     example = read_protocol(EXAMPLE)
+    assert f"```yaml\n{EXAMPLE.read_text()}```" in GUIDE.read_text()
     assert list(example.practice) == ["first-drive"] and list(example.conditions) == ["with-meter", "without-meter"]
     arguments = example.conditions["without-meter"].drive_arguments(tmp_path, example.folder, "x-v0", 7)
     monkeypatch.setattr(sys, "argv", ["sb3-chac"])
@@ -260,7 +263,7 @@ def test_forms_are_filled_in_with_the_keyboard_and_read_on_a_phone(served):  # n
             page.wait_for_selector("#form input[name=mental]")
             page.click("#form button")
             assert page.inner_text("#form .problem") == "Choose a place on each scale" and not future.done()
-            for presses in range(1, 7):  # the first scale has the keyboard already
+            for presses in range(1, 7):  # the page shows the first scale that is missing
                 for _ in range(presses):
                     page.keyboard.press("ArrowRight")
                 page.keyboard.press("Tab")

@@ -430,6 +430,7 @@ async function showForm(number) {
   dialog.scrollTop = 0;
 }
 
+byId("fields").addEventListener("input", () => { byId("form").querySelector(".problem").textContent = ""; });
 byId("form").addEventListener("cancel", (event) => event.preventDefault());
 
 function show(state) {
