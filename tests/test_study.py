@@ -396,6 +396,7 @@ def test_a_study_is_killed_and_goes_on_at_the_next_episode(tmp_path):
     assert len(list(csv.DictReader((tmp_path / "out" / SUMMARY).open()))) == 2
 
 
+@pytest.mark.slow
 def test_in_the_middle_of_a_condition_the_novice_goes_on_with_what_it_has_learned(tmp_path):
     write(tmp_path, conditions={"a": SHORT | {"episodes": 3}})
     folder = tmp_path / "out" / "participant-001"

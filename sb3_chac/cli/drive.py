@@ -197,9 +197,7 @@ def check_given(args: argparse.Namespace) -> None:
     if args.no_learning and not args.trained_agent:
         raise NotDrivable("--no-learning needs a model that can drive: -i MODEL.zip.")
     if args.no_takeover and args.algo in ("hg_dagger", "iwr") and not args.trained_agent:
-        raise NotDrivable(
-            f"--no-takeover: {args.algo} begins with a person who drives: leave it out, or begin with a model, -i."
-        )
+        raise NotDrivable(f"--no-takeover: {args.algo} begins with a person who drives: leave it out, or name a model, -i.")
     if args.query is not None and (args.no_meter or args.no_takeover):
         raise NotDrivable("--query asks for help by the meter: leave out --no-meter and --no-takeover.")
 
