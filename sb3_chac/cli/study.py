@@ -210,7 +210,7 @@ class Study:
         folder = self.participant.folder / name
         runs = sorted(folder.glob(f"{condition.algo}/*_*/"), key=lambda run: int(re.sub(r".*_", "", run.name)))
         dataset = f"drive_{len(runs) + 1}-v0"
-        # The same for all who drive this condition in this place of its episodes would let them learn the maps by heart
+        # Draws of its own for each participant and condition, and other ones when it goes on
         index = list(self.protocol.practice | self.protocol.conditions).index(name)
         seed = np.random.SeedSequence([self.protocol.seed, self.participant.number, index, done]).generate_state(1)[0]
         arguments = condition.drive_arguments(folder, self.protocol.folder, dataset, int(seed))
