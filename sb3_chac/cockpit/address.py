@@ -5,6 +5,8 @@ import socket
 from contextlib import suppress
 from typing import NamedTuple
 
+from sb3_chac.deploy.address import is_port
+
 
 class Address(NamedTuple):
     """Host and port at which the cockpit is served."""
@@ -54,7 +56,7 @@ def parse_address(text: str) -> Address:
     """
     host, _, port = text.rpartition(":")
     host = host.removeprefix("[").removesuffix("]") or "127.0.0.1"
-    if not port.isascii() or not port.isdecimal() or len(port) > 5 or int(port) > 65535:
+    if not is_port(port):
         raise ValueError(f"--serve must be PORT or HOST:PORT, for example 127.0.0.1:8000, got {text!r}.")
     return Address(host, int(port))
 

@@ -127,9 +127,9 @@ def find_dataset(dataset: str | os.PathLike[str]) -> Path:
 
 def minari_folder() -> Path:
     """
-    Return Minari's folder of datasets, which need not exist yet.
+    Find Minari's folder of datasets.
 
-    :return: where Minari keeps its datasets. It need not exist yet
+    :return: where Minari keeps them; it need not exist yet
     """
     return Path(os.environ.get("MINARI_DATASETS_PATH") or Path.home() / ".minari" / "datasets")
 

@@ -24,11 +24,21 @@ def parse_address(name: str, text: Any, low: int = 0) -> tuple[str, int]:
     :raises NotDeployable: for anything else
     """
     host, _, port = str(text).rpartition(":")
-    if not host or not port.isascii() or not port.isdecimal() or len(port) > 5 or not low <= int(port) <= 65535:
+    if not host or not is_port(port, low):
         raise NotDeployable(
             f"{name} must be HOST:PORT with a port from {low} to 65535, such as 127.0.0.1:5600, got {text!r:.80}."
         )
     return host, int(port)
+
+
+def is_port(text: str, low: int = 0) -> bool:
+    """
+    Tell whether a text is the number of a port.
+
+    :param text: the number
+    :param low: least port
+    """
+    return text.isascii() and text.isdecimal() and len(text) <= 5 and low <= int(text) <= 65535
 
 
 def resolve(name: str, host: str) -> str:
