@@ -4,6 +4,7 @@ import socket
 import subprocess
 import sys
 import threading
+import time
 
 import gymnasium as gym
 import numpy as np
@@ -260,11 +261,13 @@ def test_packets_of_others_are_left_alone():
 
 
 def test_the_command_is_a_vehicle(tmp_path):
-    command = [sys.executable, "-m", "sb3_chac", "vehicle", "--listen", "127.0.0.1:0", "--steps", "30", "--ready"]
-    process = subprocess.Popen([*command, str(tmp_path / "address")], stdout=subprocess.PIPE, text=True)
-    while not (tmp_path / "address").is_file() or not (tmp_path / "address").read_text():
+    ready = tmp_path / "address"
+    command = [sys.executable, "-m", "sb3_chac", "vehicle", "--listen", "127.0.0.1:0", "--steps", "30", "--ready", str(ready)]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    while not ready.is_file():  # it is there as a whole or not at all
         assert process.poll() is None
-    env = gym.make("RemoteVehicle-v0", address=(tmp_path / "address").read_text())
+        time.sleep(0.05)
+    env = gym.make("RemoteVehicle-v0", address=ready.read_text())
     assert env.observation_space.shape == (306,)
     env.reset(seed=0, options={"scenario": 2})
     infos = [env.step(np.array([0.0, 1.0], np.float32))[4] for _ in range(30)]

@@ -1,6 +1,7 @@
 """Arguments of the command line that several commands share."""
 
 import ast
+import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -23,13 +24,13 @@ def check_output(option: str, path: Path | None, suffixes: tuple[str, ...] = ())
         raise NotEvaluable(f"{option} {path}: the file name must end with {' or '.join(suffixes)}.")
     if not path.parent.is_dir():
         raise FileNotFoundError(f"{option} {path}: the folder {path.parent} does not exist, create it first.")
-    existed = path.exists()
     try:
-        path.open("ab").close()
+        if path.exists():
+            path.open("ab").close()
+        else:  # beside it: somebody may wait for the file itself
+            tempfile.NamedTemporaryFile(prefix=path.name, dir=path.parent).close()
     except OSError as error:
         raise NotEvaluable(f"{option} {path}: cannot be written ({error.strerror}).") from error
-    if not existed:
-        path.unlink()
 
 
 def parse_env_kwargs(pairs: list[str]) -> dict[str, Any]:

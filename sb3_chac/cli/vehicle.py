@@ -9,6 +9,7 @@ import gymnasium as gym
 import sb3_chac.envs  # noqa: F401  (registers our environments)
 from sb3_chac.cli.arguments import check_output, parse_env_kwargs
 from sb3_chac.cli.command import run_command
+from sb3_chac.common.files import write_safely
 from sb3_chac.deploy.address import bound_socket, parse_address
 from sb3_chac.deploy.metadata import NotDeployable
 from sb3_chac.deploy.remote import LateLink, VehicleServer
@@ -81,7 +82,7 @@ def run(args: argparse.Namespace) -> None:
             own = ":".join(map(str, sock.getsockname()))
             print(f"{args.env} waits for a learner at {own}", flush=True)
             if args.ready is not None:
-                args.ready.write_text(own)
+                write_safely(args.ready, own.encode())  # whoever waits for it reads all of it
             start = time.monotonic()
             try:
                 server.serve(args.steps)
