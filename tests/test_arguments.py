@@ -44,6 +44,7 @@ GOOD = {
             "relapse_window",
             "stage2_human_share",
             "anchor_coef",
+            "max_deviation",
             "cost_coef",
             "takeover_cost",
             "validation_share",

@@ -481,6 +481,33 @@ def test_pi_r_climbs_the_mean_of_z_c_as_far_as_it_is_let(anchor_coef):
     assert np.abs(predict(model, "self") - expected).mean() < 0.1
 
 
+@pytest.mark.parametrize("control", ["self", "shared"])
+@pytest.mark.parametrize("deterministic", [True, False])
+def test_pi_r_stays_near_pi_g(control, deterministic):
+    """What it executes; how far it wants to go is left to the anchor."""
+    model = in_stage_2(max_deviation=0.1, delta=0.999)
+    shift_pi_r(model, 5.0)
+    guided = predict(model, "guided")
+    actions, _ = model.predict(OBS, deterministic=deterministic, control=control)
+    deviation = np.abs(model.policy.scale_action(actions) - model.policy.scale_action(guided))
+    assert deviation.max() == pytest.approx(0.1, abs=1e-5)
+    model.policy.max_deviation = 2.0
+    actions, _ = model.predict(OBS, deterministic=deterministic, control=control)
+    assert np.abs(model.policy.scale_action(actions) - model.policy.scale_action(guided)).max() > 0.2
+
+
+@pytest.mark.parametrize("arguments", [{}, {"bootstrap": "self"}, {"shared_control": False}])
+def test_z_c_bootstraps_on_what_pi_r_may_execute(arguments):
+    model = in_stage_2(max_deviation=0.1, delta=0.999, **arguments)
+    shift_pi_r(model, 5.0)
+    asked = []
+    forward = model.confidence_critic_target.forward
+    model.confidence_critic_target.forward = lambda obs, actions: (asked.append(actions), forward(obs, actions))[1]
+    model._confidence_targets(make_batch(OBS, np.zeros((len(OBS), 2)), np.zeros(len(OBS))))
+    of_pi_r, of_pi_g = asked
+    assert float((of_pi_r - of_pi_g).abs().max()) == pytest.approx(0.1, abs=1e-5)
+
+
 # --- Save and load
 
 

@@ -54,6 +54,8 @@ class CHAC(DPVP):
     - In stage 2, Z_c bootstraps on what is executed, not on pi_r alone (``bootstrap``).
     - pi_r exploits what Z_c believes of actions that nobody has tried, and leaves the road in most episodes after the switch.
       It is tied to pi_g: it maximises Q_c - alpha log pi_r - anchor_coef ||a_r - a_g||^2 (``anchor_coef``).
+    - Where no training map is like what is seen, both critics believe in the same wrong slopes, and neither anchor nor
+      confidence holds pi_r: what it executes can be limited to a neighbourhood of a_g (``max_deviation``).
     - Z_c learns rewards in units of their root mean square (``normalize_rewards``), so that stage 2 does the same whatever the
       scale of a task's reward.
     - The return hardly shows a collision (5 of 370 on SafeDrive): the safety cost is subtracted from the reward that Z_c
@@ -84,6 +86,7 @@ class CHAC(DPVP):
     :param stage2_human_share: share of the human's transitions in the batches of stage 2
     :param anchor_coef: weight of the squared distance between the actions of pi_r and pi_g, both in [-1, 1], in pi_r's loss;
         in units of what Z_c learns
+    :param max_deviation: of pi_r's action from pi_g's in each dimension, both in [-1, 1], when it acts; 2: no limit
     :param normalize_rewards: whether Z_c learns rewards in units of their running root mean square
     :param cost_coef: what ``info["cost"]`` counts against (normalised) rewards in Z_c
     :param takeover_cost: safety cost, in Z_c, of a step of the novice after which the human took over
@@ -162,6 +165,7 @@ class CHAC(DPVP):
         bootstrap: str = "executed",
         stage2_human_share: float = 0.25,
         anchor_coef: float = 15.0,
+        max_deviation: float = 2.0,
         normalize_rewards: bool = True,
         cost_coef: float = 100.0,
         takeover_cost: float = 0.3,
@@ -232,6 +236,7 @@ class CHAC(DPVP):
         self.bootstrap = bootstrap
         self.stage2_human_share = stage2_human_share
         self.anchor_coef = anchor_coef
+        self.max_deviation = max_deviation
         self.normalize_rewards = normalize_rewards
         self.cost_coef = cost_coef
         self.takeover_cost = takeover_cost
@@ -245,7 +250,8 @@ class CHAC(DPVP):
         super()._setup_model()
         if not hasattr(self, "reward_square"):  # else it was loaded
             self.reward_square, self.n_reward_updates = 1.0, 0
-        self.policy.delta, self.policy.sigma_scale = self.delta, self.sigma_scale
+        for name in ("delta", "sigma_scale", "max_deviation"):
+            setattr(self.policy, name, getattr(self, name))
         self.policy.control = "shared" if self.shared_control else "self"
         self.confidence_update = TargetUpdate(self.confidence_critic, self.confidence_critic_target)
         self.self_update = TargetUpdate(self.self_actor, self.self_actor_target)
@@ -278,6 +284,7 @@ class CHAC(DPVP):
         check_integer("prefit_steps", self.prefit_steps, low=0)
         check_range("stage2_human_share", self.stage2_human_share, low=0.0, high=1.0)
         check_range("anchor_coef", self.anchor_coef, low=0.0)
+        check_range("max_deviation", self.max_deviation, low=0.0, high=2.0)
         check_range("cost_coef", self.cost_coef, low=0.0)
         check_range("takeover_cost", self.takeover_cost, low=0.0)
         check_integer("relapse_window", self.relapse_window, low=0)
@@ -355,12 +362,10 @@ class CHAC(DPVP):
         :return: y_q and y_z, both of shape (batch_size,)
         """
         ent_coef = self._current_ent_coef()
-        rewards, target = self._confidence_rewards(batch), self.confidence_critic_target
+        rewards = self._confidence_rewards(batch)
         if self.stage == 1:
-            return self._return_targets(self.actor_target, target, batch, rewards, ent_coef)
-        if self.bootstrap == "self" or not self.shared_control:
-            return self._return_targets(self.self_actor_target, target, batch, rewards, ent_coef)
-        return self._shared_return_targets(batch, rewards, ent_coef)
+            return self._return_targets(self.actor_target, self.confidence_critic_target, batch, rewards, ent_coef)
+        return self._stage_2_return_targets(batch, rewards, ent_coef)
 
     def _confidence_rewards(self, batch: DualReplayBufferSamples) -> th.Tensor:
         """
@@ -386,20 +391,22 @@ class CHAC(DPVP):
         return max(self.reward_square**0.5, 1e-8) if self.normalize_rewards else 1.0
 
     @th.no_grad()
-    def _shared_return_targets(
+    def _stage_2_return_targets(
         self, batch: DualReplayBufferSamples, rewards: th.Tensor, ent_coef: th.Tensor
     ) -> tuple[th.Tensor, th.Tensor]:
         """
-        Compute the return targets under shared control.
+        Compute the return targets of stage 2.
 
-        :return: y_q and y_z with a' from shared control, both of shape (batch_size,)
+        :return: y_q and y_z with a' from shared control or from pi_r, both of shape (batch_size,)
         """
         self_actions, log_prob = self.self_actor_target.action_log_prob(batch.next_observations)
         choice = self.policy.choose(batch.next_observations, self_actions, self.confidence_critic_target)
-        next_q = th.where(choice.self_drives, choice.q_self, choice.q_guided)
-        next_std = th.where(choice.self_drives, choice.std_self, choice.std_guided)
+        is_shared = self.shared_control and self.bootstrap == "executed"
+        self_drives = choice.self_drives if is_shared else th.ones_like(choice.self_drives)
+        next_q = th.where(self_drives, choice.q_self, choice.q_guided)
+        next_std = th.where(self_drives, choice.std_self, choice.std_guided)
         # The mode of pi_g has no entropy
-        return return_targets(rewards, self._discounts(batch), next_q, next_std, ent_coef * log_prob * choice.self_drives)
+        return return_targets(rewards, self._discounts(batch), next_q, next_std, ent_coef * log_prob * self_drives)
 
     def _forget_episodes(self) -> None:
         super()._forget_episodes()

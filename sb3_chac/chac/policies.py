@@ -41,6 +41,7 @@ class CHACPolicy(DPVPPolicy):
 
     :param delta: accepted probability that pi_r does worse, 0 (pi_g always acts) to 1
     :param sigma_scale: factor of sigma_c in the confidence
+    :param max_deviation: of pi_r's action from pi_g's in each dimension, both scaled to [-1, 1], when it acts; 2: no limit
     :param control: who acts in stage 2: "guided", "self" or "shared"
     """
 
@@ -51,10 +52,19 @@ class CHACPolicy(DPVPPolicy):
     averaged_self_actor: Actor
     stage: th.Tensor
 
-    def __init__(self, *args: Any, delta: float = 0.15, sigma_scale: float = 1.0, control: str = "shared", **kwargs: Any):
+    def __init__(
+        self,
+        *args: Any,
+        delta: float = 0.15,
+        sigma_scale: float = 1.0,
+        max_deviation: float = 2.0,
+        control: str = "shared",
+        **kwargs: Any,
+    ):
         super().__init__(*args, **kwargs)
         self.delta = delta
         self.sigma_scale = sigma_scale
+        self.max_deviation = max_deviation
         self.control = control
         self.last_choice: Choice | None = None
         # Saved with the parameters: a loaded policy acts as it did
@@ -88,10 +98,12 @@ class CHACPolicy(DPVPPolicy):
         Decide which policy acts in each state (T_c).
 
         :param observation: batch of observations
-        :param self_actions: a_r, shape (batch_size, action_dim); a_g is the mode of pi_g
+        :param self_actions: of pi_r, shape (batch_size, action_dim); as near to a_g, the mode of pi_g, as ``max_deviation``
+            asks, they are a_r
         :param critic: Z_c, or its target copy
         """
         guided_actions = self.actor(observation, deterministic=True)
+        self_actions = self._near(self_actions, guided_actions)
         q_self, std_self = critic.pessimistic(observation, self_actions)
         q_guided, std_guided = critic.pessimistic(observation, guided_actions)
         scaled = self.sigma_scale * std_self, self.sigma_scale * std_guided
@@ -100,6 +112,10 @@ class CHACPolicy(DPVPPolicy):
         self_drives = confidence > 1 - self.delta if self.delta < 1 else th.ones_like(confidence, dtype=th.bool)
         actions = th.where(self_drives.unsqueeze(1), self_actions, guided_actions)
         return Choice(actions, self_drives, confidence, q_self, q_guided, std_self, std_guided)
+
+    def _near(self, self_actions: th.Tensor, guided_actions: th.Tensor) -> th.Tensor:
+        """Limit the deviation of pi_r's actions from pi_g's; both and the result of shape (batch_size, action_dim)."""
+        return guided_actions + (self_actions - guided_actions).clamp(-self.max_deviation, self.max_deviation)
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         if is_traced() and self.control != "guided":  # a branch on a tensor would be lost
@@ -119,7 +135,7 @@ class CHACPolicy(DPVPPolicy):
         """
         self_actions = self.averaged_self_actor(observation, True) if deterministic else self.self_actor(observation)
         if self.control == "self":
-            return self_actions, None
+            return self._near(self_actions, self.actor(observation, deterministic=True)), None
         choice = self.choose(observation, self_actions, self.confidence_critic)
         return choice.actions, choice
 
@@ -134,7 +150,7 @@ class CHACPolicy(DPVPPolicy):
         self.self_actor.set_training_mode(mode)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
-        own = {"delta": self.delta, "sigma_scale": self.sigma_scale, "control": self.control}
+        own = {name: getattr(self, name) for name in ("delta", "sigma_scale", "max_deviation", "control")}
         return super()._get_constructor_parameters() | own
 
 

@@ -68,6 +68,7 @@ def sample_chac_params(trial: optuna.Trial, n_actions: int, n_envs: int, additio
         "delta": trial.suggest_float("delta", 0.05, 0.5),
         "sigma_scale": trial.suggest_float("sigma_scale", 0.003, 1.0, log=True),
         "tau_c": trial.suggest_float("tau_c", 0.005, 0.05, log=True),
+        "max_deviation": trial.suggest_categorical("max_deviation", [0.05, 0.1, 0.2, 2.0]),
         "anchor_coef": trial.suggest_float("anchor_coef", 1.0, 300.0, log=True),
         "cost_coef": trial.suggest_float("cost_coef", 10.0, 1000.0, log=True),
     }
