@@ -4,6 +4,8 @@
 
 One torch thread, the same prefilled replay buffer, batch size 256, net [256, 256]. The algorithms take turns in short
 blocks within one process, so that what else the machine does falls on both; the ratio of each pair of blocks counts.
+``_bf16``: float32 products made of bfloat16 ones (``torch.set_float32_matmul_precision("medium")``), which pays on
+processors with AMX or AVX512-BF16.
 """
 
 import argparse
@@ -35,6 +37,12 @@ VARIANTS = {
     "dpvp_gelu_delay1": (DPVP, "gelu", {"policy_delay": 1}),
     "chac_gelu_delay1": (CHAC, "gelu", {"policy_delay": 1}),
     "chac_gelu_delay1_stage2": (CHAC, "gelu", {"policy_delay": 1}),
+    "sac_relu_bf16": (SAC, "relu", {}),
+    "dsac_gelu_delay1_bf16": (DSAC, "gelu", {"policy_delay": 1}),
+    "dsac_gelu_delay2_bf16": (DSAC, "gelu", {"policy_delay": 2}),
+    "dpvp_gelu_delay1_bf16": (DPVP, "gelu", {"policy_delay": 1}),
+    "chac_gelu_delay1_bf16": (CHAC, "gelu", {"policy_delay": 1}),
+    "chac_gelu_delay1_stage2_bf16": (CHAC, "gelu", {"policy_delay": 1}),
 }
 
 
@@ -63,7 +71,7 @@ def prefilled(name: str, obs_dim: int, action_dim: int):
         for values in (buffer.observations, buffer.next_observations, buffer.actions, buffer.rewards):
             values[:] = rng.uniform(-1, 1, values.shape)
         buffer.full = True
-    if name.endswith("stage2"):
+    if "stage2" in name:
         model.policy.start_stage_2()
     return model
 
@@ -93,6 +101,7 @@ def main() -> None:
             speeds: dict[str, list[float]] = {name: [] for name in VARIANTS}
             for block in range(-2, args.blocks):  # two blocks to warm up
                 for name, model in models.items():
+                    th.set_float32_matmul_precision("medium" if name.endswith("bf16") else "highest")
                     start = time.process_time()
                     model.train(gradient_steps=args.steps, batch_size=BATCH_SIZE)
                     if block >= 0:

@@ -280,18 +280,24 @@ def learning() -> str:
 
 def speed() -> str:
     names = {
-        "dsac_gelu_delay1": "`policy_delay=1`",
-        "dsac_relu_delay1": "`policy_delay=1`, ReLU as SAC",
-        "dsac_gelu_delay2": "default (`policy_delay=2`)",
+        "dsac_relu_delay1": "DSAC, `policy_delay=1`, ReLU as SAC",
+        "dsac_gelu_delay1": "DSAC, `policy_delay=1`",
+        "dsac_gelu_delay2": "DSAC, `policy_delay=2` (default)",
+        "dpvp_gelu_delay1": "D-PVP, `policy_delay=1`",
+        "chac_gelu_delay1": "C-HAC, stage 1, `policy_delay=1`",
+        "chac_gelu_delay1_stage2": "C-HAC, stage 2, `policy_delay=1`",
     }
-    found = read(RESULTS / "speed.csv")
-    rows = [["DSAC", "obs 259", "obs 17"]]
-    for name, title in names.items():
-        key, cells = "{}_steps_per_cpu_second", []
-        for size in ("259", "17"):
-            here = [row for row in found if row["obs_dim"] == size]
-            ratios = [float(row[key.format(name)]) / float(row[key.format("sac_relu")]) for row in here]
-            cells.append(f"{np.median(ratios):.2f}x")
+    processors = {"speed": "AMD Zen 5", "speed-epyc": "AMD EPYC", "speed-xeon": "Intel Xeon (AMX)"}
+    found = {name: [row for row in read(RESULTS / f"{name}.csv") if row["obs_dim"] == "259"] for name in processors}
+    columns = [(name, "") for name in processors] + [("speed-xeon", "_bf16")]
+    rows = [["", *processors.values(), "Intel Xeon (AMX), bfloat16"]]
+    for variant, title in names.items():
+        cells = []
+        for name, suffix in columns:
+            key = "{}_steps_per_cpu_second"
+            here = [row for row in found[name] if row.get(key.format(variant + suffix))]
+            ratios = [float(row[key.format(variant + suffix)]) / float(row[key.format("sac_relu")]) for row in here]
+            cells.append(f"{np.median(ratios):.2f}x" if ratios else "")
         rows.append([title, *cells])
     return curves.markdown(rows)
 
@@ -319,6 +325,18 @@ def rounds() -> str:
         ]
         steps = float(runs["iwr"][0][number]["human_steps"])
         rows.append([thousands(steps) + (" (warm-up)" if number == 0 else ""), *cells])
+    return curves.markdown(rows)
+
+
+def beyond(folder: Path = RESULTS / "beyond") -> str:
+    rows = [["seed", "human", "end of stage 1", "end of stage 2", "best of stage 2", "steps of the human"]]
+    for path in sorted(folder.glob("[0-9]*.csv")):
+        found = read(path)
+        returns = {
+            who: [float(row["return_mean"]) for row in found if row["who"] == who] for who in ("human", "stage 1", "stage 2")
+        }
+        ends = [returns["human"][-1], returns["stage 1"][-1], np.mean(returns["stage 2"][-3:]), max(returns["stage 2"])]
+        rows.append([path.stem, *(f"{value:.0f}" for value in ends), found[-1]["human_steps"]])
     return curves.markdown(rows)
 
 
