@@ -61,7 +61,7 @@ class Config(NamedTuple):
     title: str
     overrides: dict[str, Any] = {}  # noqa: RUF012
     goes_on_from: str | None = None  # the method whose last state it starts with
-    budget: int | None = None  # steps of the human, if not that of the yaml
+    human: dict[str, Any] | None = None  # arguments of the InterventionWrapper, if not those of the yaml
 
 
 METHODS = {
@@ -69,8 +69,8 @@ METHODS = {
     "dsac": Config("dsac", 200_000, "DSAC"),
     "pvp": Config("pvp", GUIDED, "PVP"),
     "dpvp": Config("dpvp", GUIDED, "D-PVP"),
-    "dpvp-1k": Config("dpvp", GUIDED, "D-PVP, 1K human steps", budget=1000),
-    "dpvp-2k": Config("dpvp", GUIDED, "D-PVP, 2K human steps", budget=2000),
+    "dpvp-1k": Config("dpvp", GUIDED, "D-PVP, 1K human steps", human={"budget": 1000}),
+    "dpvp-2k": Config("dpvp", GUIDED, "D-PVP, 2K human steps", human={"budget": 2000}),
     "chac-stage-1": Config("chac", SWITCH, "C-HAC, end of stage 1"),
     "chac": Config("chac", 200_000, "C-HAC", {}, "chac-stage-1"),
     "chac-no-share": Config("chac", SWITCH + AFTER_SWITCH, "C-HAC, No Share", {"shared_control": False}, "chac-stage-1"),
@@ -87,13 +87,13 @@ ACTING = {
 }
 
 
-def make_model(algo: str, seed: int, env_id: str, budget: int | None = None, **overrides: Any) -> BaseAlgorithm:
-    """As ``rl_zoo3 train --algo <algo> --env <env_id>`` makes it, with another budget of the human if there is one."""
+def make_model(algo: str, seed: int, env_id: str, human: dict[str, Any] | None = None, **overrides: Any) -> BaseAlgorithm:
+    """As ``rl_zoo3 train --algo <algo> --env <env_id>`` makes it, with another human if there are arguments of one."""
     params = yaml.safe_load(hyperparams_file(algo).read_text())[env_id]
     del params["n_timesteps"]
-    if budget is not None:
+    if human is not None:
         (wrapper_kwargs,) = params["env_wrapper"][0].values()
-        wrapper_kwargs["budget"] = budget
+        wrapper_kwargs |= human
     wrapper = get_wrapper_class(params)
     params.pop("env_wrapper", None)
     policy_kwargs = eval(params.get("policy_kwargs", "dict()"), {"dict": dict, "th": th})
@@ -151,7 +151,7 @@ def run(
     path, end = results / f"{name}-{seed}.csv", models / f"{name}-{seed}.zip"
     for folder in (results, models):
         folder.mkdir(parents=True, exist_ok=True)
-    model = make_model(method.algo, seed, env_id, method.budget)
+    model = make_model(method.algo, seed, env_id, method.human)
     maps = TUNING_MAPS if seed >= FIRST_TUNING_SEED else TEST_MAPS
     record = functools.partial(Record, path, {"method": name, "seed": seed}, env_id, every, maps)
     if method.goes_on_from is None:

@@ -43,6 +43,7 @@ GOOD = {
             "prefit_steps",
             "relapse_window",
             "stage2_human_share",
+            "stage2_guided_share",
             "anchor_coef",
             "max_deviation",
             "cost_coef",

@@ -371,6 +371,24 @@ def test_batches_of_each_stage(share, n_human):
     assert model._sample_batch(16).takeovers.sum() == n_human
 
 
+@pytest.mark.parametrize("share, least", [(0.0, 0), (0.5, 8), (0.75, 12)])
+def test_what_the_human_guarded_keeps_its_share_in_stage_2(share, least, tmp_path):
+    """However much stage 2 adds, also after the buffer has been saved and loaded."""
+    arguments = {"stage2_human_share": 0.25, "stage2_guided_share": share, "buffer_size": 1000}
+    model = make_chac(switch_after=40, **arguments).learn(50)
+    novice = model.replay_buffer.novice
+    novice.arrays["takeover_follows"][:] = np.arange(len(novice.arrays["reward"]))[:, None] < model.replay_buffer.n_guided
+    for row in ({name: array[-1] for name, array in novice.arrays.items()} for _ in range(900)):
+        novice.append(row)
+    model.save_replay_buffer(tmp_path / "buffer")
+    loaded = make_chac(**arguments)
+    loaded.set_parameters(model.get_parameters())
+    loaded.load_replay_buffer(tmp_path / "buffer")
+    for one in (model, loaded):
+        counts = [float(one._sample_batch(16).takeovers_follow.sum()) for _ in range(20)]
+        assert min(counts) >= least and np.mean(counts) < least + 1
+
+
 @pytest.mark.parametrize("shared_control", [True, False])
 @pytest.mark.parametrize("sign, who", [(1, "self"), (-1, "guided")])
 def test_the_executed_action_is_stored(shared_control, sign, who):

@@ -476,3 +476,16 @@ def test_a_row_that_was_overwritten_is_not_marked():
     add(buffer, 0)  # the second environment overwrites the first one's row
     add(buffer, 1, takeover=[True, False], start=[True, False])
     assert not any(value for (value,) in rows(buffer.novice, "takeover_follows"))
+
+
+def test_rows_of_before_have_a_share_of_their_own_until_they_are_overwritten():
+    buffer = make_buffer(capacity=10)
+    fill(buffer, novice=4)
+    buffer.end_guidance()
+    for last, early in ((9, {0, 1, 2, 3}), (11, {2, 3}), (13, set())):
+        for t in range(buffer.novice.added, last + 1):
+            add(buffer, t)
+        drawn = np.concatenate([buffer.sample(8, human_share=0.0, guided_share=0.5).observations[:, 0] for _ in range(80)])
+        assert set(drawn.astype(int)) == set(range(last - 9, last + 1))
+        share = np.isin(drawn, list(early)).mean()
+        assert share == pytest.approx(0.5 + 0.5 * len(early) / 10 if early else 0.0, abs=0.1)

@@ -566,6 +566,8 @@ def test_actions_of_any_shape(algorithm):
         ({"prefit_steps": -1}, [CHAC]),
         ({"bootstrap": "guided"}, [CHAC]),
         ({"stage2_human_share": 1.5}, [CHAC]),
+        ({"stage2_guided_share": 1.5}, [CHAC]),
+        ({"max_deviation": 2.5}, [CHAC]),
         ({"weight_decay": -1.0}, [DPVP, CHAC]),
         ({"average_tau": 1.5}, [DPVP, CHAC]),
         ({"anchor_coef": -1.0}, [CHAC]),

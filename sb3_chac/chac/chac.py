@@ -84,6 +84,8 @@ class CHAC(DPVP):
     :param prefit_steps: gradient steps of Z_c, on both stores, at the switch
     :param bootstrap: "executed": Z_c evaluates what is executed in stage 2 (shared control); "self": pi_r
     :param stage2_human_share: share of the human's transitions in the batches of stage 2
+    :param stage2_guided_share: least share of the novice's transitions of stage 1: those before a takeover are what Z_c
+        knows danger from, and would be the rarer the longer stage 2 goes on
     :param anchor_coef: weight of the squared distance between the actions of pi_r and pi_g, both in [-1, 1], in pi_r's loss;
         in units of what Z_c learns
     :param max_deviation: of pi_r's action from pi_g's in each dimension, both in [-1, 1], when it acts; 2: no limit
@@ -102,6 +104,7 @@ class CHAC(DPVP):
         "prefit_steps": 0,
         "bootstrap": "self",
         "stage2_human_share": 0.0,
+        "stage2_guided_share": 0.0,
         "anchor_coef": 0.0,
         "normalize_rewards": False,
         "cost_coef": 0.0,
@@ -164,6 +167,7 @@ class CHAC(DPVP):
         prefit_steps: int = 8000,
         bootstrap: str = "executed",
         stage2_human_share: float = 0.25,
+        stage2_guided_share: float = 0.5,
         anchor_coef: float = 15.0,
         max_deviation: float = 2.0,
         normalize_rewards: bool = True,
@@ -235,6 +239,7 @@ class CHAC(DPVP):
         self.prefit_steps = prefit_steps
         self.bootstrap = bootstrap
         self.stage2_human_share = stage2_human_share
+        self.stage2_guided_share = stage2_guided_share
         self.anchor_coef = anchor_coef
         self.max_deviation = max_deviation
         self.normalize_rewards = normalize_rewards
@@ -283,6 +288,7 @@ class CHAC(DPVP):
             check_range("tau_c", self.tau_c, low=0.0, high=1.0)
         check_integer("prefit_steps", self.prefit_steps, low=0)
         check_range("stage2_human_share", self.stage2_human_share, low=0.0, high=1.0)
+        check_range("stage2_guided_share", self.stage2_guided_share, low=0.0, high=1.0)
         check_range("anchor_coef", self.anchor_coef, low=0.0)
         check_range("max_deviation", self.max_deviation, low=0.0, high=2.0)
         check_range("cost_coef", self.cost_coef, low=0.0)
@@ -312,8 +318,8 @@ class CHAC(DPVP):
         return [*super()._optimizers(), self.confidence_critic.optimizer, self.self_actor.optimizer]
 
     def _sample_batch(self, batch_size: int) -> DualReplayBufferSamples:
-        share = 0.5 if self.stage == 1 else self.stage2_human_share
-        return self.replay_buffer.sample(batch_size, env=self._vec_normalize_env, human_share=share)
+        shares = (0.5, 0.0) if self.stage == 1 else (self.stage2_human_share, self.stage2_guided_share)
+        return self.replay_buffer.sample(batch_size, self._vec_normalize_env, *shares)
 
     def _gradient_step(self, batch: DualReplayBufferSamples) -> dict[str, th.Tensor]:
         return self._stage_1_step(batch) if self.stage == 1 else self._stage_2_step(batch)
@@ -467,6 +473,7 @@ class CHAC(DPVP):
 
     def _switch_to_stage_2(self) -> None:
         self._disarm()
+        self.replay_buffer.end_guidance()
         self.policy.start_stage_2()
         if self.watch is not None:
             self.watch.begin(self.policy)

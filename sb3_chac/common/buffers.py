@@ -89,13 +89,19 @@ class TransitionStore:
         if number >= self.added - self.capacity:
             self.arrays[name][number % self.capacity] = value
 
-    def sample(self, n_rows: int) -> dict[str, np.ndarray]:
+    def sample(self, n_rows: int, n_early: int = 0, before: int = 0) -> dict[str, np.ndarray]:
         """
         Sample transitions.
 
+        :param n_early: rows that are drawn from those that were appended before the ``before``-th, as long as there are any
         :return: rows drawn with replacement, an array of shape (n_rows, ...) per column
         """
-        rows = np.random.randint(0, len(self), size=n_rows)
+        first = max(0, self.added - self.capacity)  # number of the oldest row
+        early = range(first, before if n_early else first)
+        n_early = n_early if early else 0
+        rows = np.random.randint(0, len(self), size=n_rows - n_early)
+        if early:
+            rows = np.concatenate([np.random.randint(early.start, early.stop, size=n_early) % self.capacity, rows])
         return {name: array[rows] for name, array in self.arrays.items()}
 
     def __getstate__(self) -> dict[str, Any]:
@@ -178,12 +184,14 @@ class DualReplayBuffer(ReplayBuffer):
         self.pending: defaultdict[int, deque[dict[str, Any]]] = defaultdict(deque)
         # Number of the novice's row that each environment stored last, in this episode
         self.last_novice_row: dict[int, int] = {}
+        self.n_guided = 0  # rows of the novice that were appended while the human was there
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
         for store in (self.novice, self.human):
             store.complete(dict.fromkeys(SCALARS, ((1,), np.float32)))
         self.last_novice_row = state.get("last_novice_row", {})
+        self.n_guided = state.get("n_guided", 0)
         for row in chain.from_iterable(self.pending.values()):
             row |= {name: np.zeros(1, np.float32) for name in SCALARS if name not in row}
 
@@ -199,6 +207,11 @@ class DualReplayBuffer(ReplayBuffer):
         self.novice.added = self.human.added = 0
         self.pending.clear()
         self.last_novice_row.clear()
+        self.n_guided = 0
+
+    def end_guidance(self) -> None:
+        """Note that the human is not there any more, see ``guided_share`` of ``sample``."""
+        self.n_guided = self.novice.added
 
     def add(
         self,
@@ -283,7 +296,7 @@ class DualReplayBuffer(ReplayBuffer):
             self._flush(pending)
 
     def sample(  # type: ignore[override]
-        self, batch_size: int, env: VecNormalize | None = None, human_share: float = 0.5
+        self, batch_size: int, env: VecNormalize | None = None, human_share: float = 0.5, guided_share: float = 0.0
     ) -> DualReplayBufferSamples:
         """
         Sample a batch from both stores.
@@ -292,6 +305,7 @@ class DualReplayBuffer(ReplayBuffer):
         :param env: to normalize observations and rewards with
         :param human_share: share of the human's rows. As long as a store holds fewer rows than its part of the batch, all are
             taken from the other one
+        :param guided_share: share of those rows of the novice that were stored before ``end_guidance``
         :raises ValueError: if the buffer is empty
         """
         if self.size() == 0:  # better short returns than none
@@ -301,9 +315,12 @@ class DualReplayBuffer(ReplayBuffer):
             n_human = 0
         elif len(self.novice) < batch_size - n_human:
             n_human = batch_size
-        parts = [
-            store.sample(n) for store, n in ((self.novice, batch_size - n_human), (self.human, n_human)) if n and len(store)
-        ]
+        n_novice = batch_size - n_human
+        parts = []
+        if n_novice and len(self.novice):
+            parts.append(self.novice.sample(n_novice, min(n_novice, round(guided_share * batch_size)), self.n_guided))
+        if n_human and len(self.human):
+            parts.append(self.human.sample(n_human))
         if not parts:  # one store was short, the other is empty
             parts = [store.sample(batch_size) for store in (self.novice, self.human) if len(store)]
         if not parts:
