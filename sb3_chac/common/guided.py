@@ -14,7 +14,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_chac.common import contract
 from sb3_chac.common.buffers import DualReplayBuffer
-from sb3_chac.common.checks import check_action_space, check_finite, number_in
+from sb3_chac.common.checks import check_action_space, number_in
 from sb3_chac.common.costs import EpisodeCosts, record_costs
 from sb3_chac.common.demonstrations import Dataset, load_demonstrations
 from sb3_chac.common.off_policy_algorithm import CheckedOffPolicyAlgorithm
@@ -35,7 +35,7 @@ COUNTS = (
 # Count -> keys of ``info`` that measure it, the first that is there counts. highway-env's ``crashed`` stays until the end
 EVENTS = {"collisions": ("collision", "crashed"), "departures": ("out_of_road",)}
 LASTING = ("crashed",)
-STATE_OF_ENVS = ("_wrapped", "_budget", "_expected", "_events_last", "_human_was_seen")
+STATE_OF_ENVS = ("_wrapped", "_budget", "_events_last", "_human_was_seen")
 
 
 class GuidedOffPolicyAlgorithm(CheckedOffPolicyAlgorithm):
@@ -68,7 +68,6 @@ class GuidedOffPolicyAlgorithm(CheckedOffPolicyAlgorithm):
             self.measured: set[str] = set()  # what is logged of ``counts`` besides the takeovers
         self._wrapped: list[int] = []  # indices of the environments in which the human is asked
         self._budget: int | None = None
-        self._expected: list[tuple[int, int]] | None = None  # see ``_begin_step``
         self._forget_episodes()
         self.ep_cost_buffer: deque[float] = deque(maxlen=self._stats_window_size)
         with warnings.catch_warnings():
@@ -115,7 +114,12 @@ class GuidedOffPolicyAlgorithm(CheckedOffPolicyAlgorithm):
         check_action_space(wrapped.action_space)
         return wrapped
 
+    def _end_trajectories(self) -> None:
+        if self.replay_buffer is not None:
+            self.replay_buffer.end_trajectories()
+
     def _forget_episodes(self) -> None:
+        super()._forget_episodes()
         self.episode_costs = EpisodeCosts(self.n_envs)
         self.human_driving = np.zeros(self.n_envs, dtype=bool)
         self._events_last = np.zeros((self.n_envs, len(LASTING)), dtype=bool)
@@ -138,9 +142,6 @@ class GuidedOffPolicyAlgorithm(CheckedOffPolicyAlgorithm):
         progress_bar: bool = False,
     ) -> tuple[int, BaseCallback]:
         self.replay_buffer.end_trajectories()
-        if reset_num_timesteps or self._last_obs is None:  # the environments are about to be reset
-            self._forget_episodes()
-            self._expected = None
         assert self.env is not None
         self._wrapped = contract.wrapped_indices(self.env)
         self._human_was_seen = bool(self._wrapped)
@@ -212,25 +213,13 @@ class GuidedOffPolicyAlgorithm(CheckedOffPolicyAlgorithm):
             self._ask_wrappers(self._wrapped, "disarm")
 
     def _begin_step(self) -> None:
-        """
-        Announce that the next step of the environments is one of the training. If somebody else has been in them since the
-        last one (an evaluation in the training environment), new episodes begin.
-        """
-        expected, self._expected = self._expected, [(-1, -1)] * len(self._wrapped)  # until the step is made
-        if self._announce_step() != expected and expected is not None:
-            self._start_over()
-            self._announce_step()
-
-    def _announce_step(self) -> list[tuple[int, int]]:
-        """
-        Announce the next step to the wrappers.
-
-        :return: numbers of steps and resets by others since the last one, of each wrapped environment
-        """
+        super()._begin_step()
         may_drive = self._may_drive()
         if len(may_drive) == len(self._wrapped):
-            return self._ask_wrappers(self._wrapped, "begin_step", True)
-        return [self._ask_wrappers([idx], "begin_step", idx in may_drive)[0] for idx in self._wrapped]
+            self._ask_wrappers(self._wrapped, "begin_step", True)
+        else:
+            for idx in self._wrapped:
+                self._ask_wrappers([idx], "begin_step", idx in may_drive)
 
     def _may_drive(self) -> list[int]:
         """
@@ -243,25 +232,9 @@ class GuidedOffPolicyAlgorithm(CheckedOffPolicyAlgorithm):
         left = max(0, self._budget - sum(state["human_steps"] for state in self.wrapper_states))
         return sorted(self._wrapped, key=lambda idx: not self.human_driving[idx])[:left]
 
-    def _start_over(self) -> None:
-        """Begin new episodes in all environments."""
-        assert self.env is not None
-        self.replay_buffer.end_trajectories()
-        self._forget_episodes()
-        self._last_obs = self.env.reset()  # type: ignore[assignment]
-        check_finite("observation", self._last_obs, self.num_timesteps)  # type: ignore[arg-type]
-        if self._vec_normalize_env is not None:
-            self._last_original_obs = self._vec_normalize_env.get_original_obs()
-
-    def _update_info_buffer(self, infos: list[dict[str, Any]], dones: np.ndarray | None = None) -> None:
-        super()._update_info_buffer(infos, dones)
-        assert dones is not None
-        self._expected = [(0, int(dones[idx])) for idx in self._wrapped]  # a VecEnv resets what is over
-
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
     ) -> tuple[np.ndarray, np.ndarray]:
-        self._begin_step()
         # A model that has learned before does not start with random actions again
         return super()._sample_action(0 if self._n_updates else learning_starts, action_noise, n_envs)
 
