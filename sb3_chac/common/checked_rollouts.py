@@ -15,12 +15,13 @@ from sb3_chac.common.checked_env import CheckedVecEnv, check_env_is_there, check
 from sb3_chac.common.checks import check_finite
 from sb3_chac.common.own_arrays import keep_last_observations
 from sb3_chac.common.own_steps import NoticesOthers
+from sb3_chac.common.saved_by import NamedAlgorithm
 from sb3_chac.common.utils import detach_distributions
 
 SelfChecked = TypeVar("SelfChecked", bound="CheckedRollouts")
 
 
-class CheckedRollouts(NoticesOthers, OnPolicyAlgorithm):
+class CheckedRollouts(NamedAlgorithm, NoticesOthers, OnPolicyAlgorithm):
     """Base of on-policy algorithms that refuse what is not finite before it is stored, as ``CheckedOffPolicyAlgorithm``."""
 
     @checked

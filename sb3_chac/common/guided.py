@@ -14,7 +14,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_chac.common import contract
 from sb3_chac.common.buffers import DualReplayBuffer
-from sb3_chac.common.checks import check_action_space, number_in
+from sb3_chac.common.checks import check_action_space, check_policy, number_in
 from sb3_chac.common.costs import EpisodeCosts, record_costs
 from sb3_chac.common.demonstrations import Dataset, load_demonstrations
 from sb3_chac.common.off_policy_algorithm import CheckedOffPolicyAlgorithm
@@ -52,6 +52,7 @@ class GuidedOffPolicyAlgorithm(CheckedOffPolicyAlgorithm):
     replay_buffer: DualReplayBuffer
 
     def _setup_model(self) -> None:
+        check_policy(type(self), self.policy_class, self.required_policy)
         if self.replay_buffer_class is None:
             self.replay_buffer_class = DualReplayBuffer
         if not issubclass(self.replay_buffer_class, DualReplayBuffer):

@@ -30,11 +30,12 @@ from sb3_chac.common.checks import (
 )
 from sb3_chac.common.own_arrays import keep_last_observations
 from sb3_chac.common.own_steps import NoticesOthers
+from sb3_chac.common.saved_by import NamedAlgorithm
 
 SelfChecked = TypeVar("SelfChecked", bound="CheckedOffPolicyAlgorithm")
 
 
-class CheckedOffPolicyAlgorithm(NoticesOthers, OffPolicyAlgorithm):
+class CheckedOffPolicyAlgorithm(NamedAlgorithm, NoticesOthers, OffPolicyAlgorithm):
     """
     SB3's OffPolicyAlgorithm for continuous actions, which refuses bad arguments, checkpoints of other algorithms and
     observations or rewards that are not finite, each with one message, before anything is changed or stored.
