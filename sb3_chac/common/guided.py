@@ -14,7 +14,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_chac.common import contract
 from sb3_chac.common.buffers import DualReplayBuffer
-from sb3_chac.common.checks import check_action_space, check_policy, number_in
+from sb3_chac.common.checks import check_action_space, check_policy, happened_in, number_in
 from sb3_chac.common.costs import EpisodeCosts, record_costs
 from sb3_chac.common.demonstrations import Dataset, load_demonstrations
 from sb3_chac.common.off_policy_algorithm import CheckedOffPolicyAlgorithm
@@ -35,6 +35,7 @@ COUNTS = (
 # Count -> keys of ``info`` that measure it, the first that is there counts. highway-env's ``crashed`` stays until the end
 EVENTS = {"collisions": ("collision", "crashed"), "departures": ("out_of_road",)}
 LASTING = ("crashed",)
+WRAPPER_COUNTS = ("human_steps", "total_steps")  # of the InterventionWrapper, in ``info``
 STATE_OF_ENVS = ("_wrapped", "_budget", "_events_last", "_human_was_seen")
 
 
@@ -202,7 +203,7 @@ class GuidedOffPolicyAlgorithm(CheckedOffPolicyAlgorithm):
         return contract.ask_wrappers(self.env, indices, method, *args)
 
     def _note_wrapper_states(self, states: dict[int, dict[str, int]]) -> None:
-        nothing = {"human_steps": 0, "total_steps": 0}
+        nothing = dict.fromkeys(WRAPPER_COUNTS, 0)
         self.wrapper_states = [states.get(idx, nothing) for idx in range(self.n_envs)]
 
     def _arm(self) -> None:
@@ -259,10 +260,15 @@ class GuidedOffPolicyAlgorithm(CheckedOffPolicyAlgorithm):
                     contract.check_reports(self.env, idx)
                 executed[idx] = contract.scaled(report.action, self.action_space, idx)
             start = info.get(contract.TAKEOVER_START)
-            if start is None:
-                start = report.takeover and not self.human_driving[idx]
-            own = {"takeover": report.takeover, "takeover_start": bool(start), "novice_action": buffer_action[idx]}
-            marked.append({**info, **own, **{name: number_in(info, name, idx) for name in ("cost", "takeover_cost")}})
+            starts = contract.truth(contract.TAKEOVER_START, start, idx) if start is not None else not self.human_driving[idx]
+            own = {
+                "takeover": report.takeover,
+                "takeover_start": report.takeover and starts,
+                "novice_action": buffer_action[idx],
+                **{name: number_in(info, name, idx) for name in ("cost", "takeover_cost")},
+                **{key: happened_in(info, key, idx) for keys in EVENTS.values() for key in keys},
+            }
+            marked.append({**info, **own})
         super()._store_transition(replay_buffer, executed, new_obs, reward, dones, marked)
         self.human_driving = np.array([report.takeover for report in reports]) & ~dones.astype(bool)
         self._human_was_seen |= any(report.says_so for report in reports)
@@ -273,9 +279,17 @@ class GuidedOffPolicyAlgorithm(CheckedOffPolicyAlgorithm):
         Check that an action arrived as it was sent.
 
         :param sent: scaled to [-1, 1]
-        :raises ValueError: if another action arrived where the human takes over than the one that was sent
+        :raises ValueError: if another action arrived where the human takes over than the one that was sent, or if one cannot
+            know as nothing is told of the takeover
         """
-        received = info.get(contract.RECEIVED_ACTION) if idx in self._wrapped else None  # else it is the environment's own
+        if idx not in self._wrapped:
+            return  # the key is the environment's own
+        if not {contract.TAKEOVER, contract.RECEIVED_ACTION, *WRAPPER_COUNTS} <= info.keys():
+            raise ValueError(
+                f"info of environment {idx} lacks what the InterventionWrapper told of the takeover: a wrapper above it "
+                "hands out an info of its own. Let it add to the info that it gets. Nothing of this step was stored."
+            )
+        received = info[contract.RECEIVED_ACTION]
         if received is None:
             return
         sent = np.asarray(self.policy.unscale_action(sent), np.float64)
@@ -296,16 +310,16 @@ class GuidedOffPolicyAlgorithm(CheckedOffPolicyAlgorithm):
                 counts["safety_cost"] += info["cost"]
                 counts["safety_cost_human"] += info["cost"] * takeover
             for name, keys in EVENTS.items():
-                key = next((key for key in keys if info.get(key) is not None), None)
+                begins = {key: self._happens(idx, key, bool(info[key]), bool(done)) for key in keys}
+                key = next((key for key in keys if info[key] is not None), None)
                 if key is not None:
                     self.measured.add(name)
-                    counts[name] += self._happens(idx, key, bool(info[key]), bool(done))
+                    counts[name] += begins[key]
         finished = self.episode_costs.add([info["cost"] for info in infos], dones)
         if self.safety_cost is not None:
             self.ep_cost_buffer.extend(finished)
         if self._wrapped:
-            names = ("human_steps", "total_steps")
-            self._note_wrapper_states({idx: {name: infos[idx][name] for name in names} for idx in self._wrapped})
+            self._note_wrapper_states({idx: {name: infos[idx][name] for name in WRAPPER_COUNTS} for idx in self._wrapped})
 
     def _happens(self, idx: int, key: str, value: bool, done: bool) -> bool:
         """
