@@ -84,6 +84,69 @@ def test_what_else_an_environment_tells_is_left_alone(name, own, key, watched):
     assert len(actions) >= 4 and np.allclose(actions, HUMAN)
 
 
+ODD_EVENTS = {"array": np.array([True, False]), "number": 2, "NumPy's": np.bool_(True), "None": None, "no": np.zeros(2)}
+
+
+@pytest.mark.parametrize("key", ["collision", "crashed", "out_of_road"])
+@pytest.mark.parametrize("value", ODD_EVENTS.values(), ids=ODD_EVENTS)
+def test_events_of_any_kind_are_counted(value, key):
+    model = make_any("PVP", Told(lambda drives: gym_hil(drives) | ({key: value} if drives else {key: None}))).learn(24)
+    name = "departures" if key == "out_of_road" else "collisions"
+    times = 0 if value is None or not np.any(value) else 8
+    assert model.counts[name] == (times / 2 if key == "crashed" else times)  # which lasts for the two steps
+    assert (name in model.measured) == (value is not None)
+
+
+@pytest.mark.parametrize("key", ["collision", "crashed", "out_of_road", "takeover_start"])
+@pytest.mark.parametrize("value", ["no", np.nan, b"", {}, 1j], ids=str)
+@each_guided
+def test_events_that_are_no_truth_values_are_refused(name, value, key):
+    model = make_any(name, Told(lambda drives: gym_hil(drives) | {key: value}))
+    with pytest.raises(ValueError, match=rf"^info\['{key}'\] of environment 0 must be a boolean, got"):
+        model.learn(24)
+    assert len(model.replay_buffer.human) + len(model.replay_buffer.novice) <= 2
+
+
+@each_guided
+def test_a_takeover_begins_where_the_human_takes_over_only(name):
+    model = make_any(name, Told(lambda drives: gym_hil(drives) | {"takeover_start": np.array([True])})).learn(24)
+    assert model.counts["takeovers"] == model.counts["human_steps"] == 8
+    assert not model.replay_buffer.novice.arrays["takeover_start"].any()
+
+
+class Forgetful(gym.Wrapper):
+    def step(self, action):
+        *step, _ = self.env.step(action)
+        return *step, {}
+
+
+class VecForgetful(VecEnvWrapper):
+    def reset(self):
+        return self.venv.reset()
+
+    def step_wait(self):
+        observations, rewards, dones, infos = self.venv.step_wait()
+        return observations, rewards, dones, [{"TimeLimit.truncated": True} for _ in infos]
+
+
+@pytest.mark.parametrize(
+    "wrap",
+    [
+        lambda make: Forgetful(make()),
+        lambda make: VecForgetful(DummyVecEnv([make])),
+        lambda make: SubprocVecEnv([lambda: Forgetful(make())]),
+    ],
+    ids=["gymnasium's", "VecEnvWrapper", "in another process"],
+)
+@each_guided
+def test_wrappers_that_drop_what_is_told_are_refused(name, wrap):
+    model = make_any(name, wrap(lambda: InterventionWrapper(Walk(), human, "always")))
+    with pytest.raises(ValueError, match=r"^info of environment 0 lacks what the InterventionWrapper told"):
+        model.learn(24)
+    assert len(model.replay_buffer.human) == len(model.replay_buffer.novice) == 0
+    model.get_env().close()
+
+
 # --- Units of reports, where the wrappers are out of sight
 
 

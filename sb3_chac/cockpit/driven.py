@@ -205,7 +205,6 @@ class DrivenTraining(Base):
         infos: list[dict[str, Any]],
     ) -> None:
         if infos[0].get("unattended"):  # nobody's decision: nothing is to be learned from it
-            self.replay_buffer.end_trajectories()
             self._forget_episodes()
             self._last_obs = new_obs
             return

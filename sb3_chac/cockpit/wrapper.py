@@ -7,7 +7,7 @@ import numpy as np
 
 from sb3_chac.cockpit.recording import CrashSafeRecorder
 from sb3_chac.cockpit.session import Session, lost_message
-from sb3_chac.common.checks import number_in
+from sb3_chac.common.checks import happened_in, number_in
 from sb3_chac.common.contract import TakeoverDisplay
 from sb3_chac.human.intervention import ControlState, InterventionWrapper
 
@@ -110,8 +110,9 @@ class Cockpit(gym.Wrapper):
         :param info: of a step
         :return: whether one has begun in it
         """
-        before, self._touched = self._touched, bool(info.get("crashed", False))
-        return bool(info.get("collision", self._touched and not before))
+        before, self._touched = self._touched, bool(happened_in(info, "crashed"))
+        collision = happened_in(info, "collision")
+        return self._touched and not before if collision is None else collision
 
     def _show(self, info: dict[str, Any], takeover: bool, **changes: Any) -> None:
         if isinstance(self.unwrapped, TakeoverDisplay):

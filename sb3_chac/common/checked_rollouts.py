@@ -1,7 +1,9 @@
 """Refuses steps of the environments that are not finite, for the algorithms that learn from rollouts."""
 
-from typing import TypeVar
+import copy
+from typing import Any, TypeVar
 
+import numpy as np
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
@@ -12,12 +14,14 @@ from sb3_chac.common.arguments import checked
 from sb3_chac.common.checked_env import CheckedVecEnv, check_env_is_there, check_what_is_normalized
 from sb3_chac.common.checks import check_finite
 from sb3_chac.common.own_arrays import keep_last_observations
+from sb3_chac.common.own_steps import NoticesOthers
+from sb3_chac.common.saved_by import NamedAlgorithm
 from sb3_chac.common.utils import detach_distributions
 
 SelfChecked = TypeVar("SelfChecked", bound="CheckedRollouts")
 
 
-class CheckedRollouts(OnPolicyAlgorithm):
+class CheckedRollouts(NamedAlgorithm, NoticesOthers, OnPolicyAlgorithm):
     """Base of on-policy algorithms that refuse what is not finite before it is stored, as ``CheckedOffPolicyAlgorithm``."""
 
     @checked
@@ -47,6 +51,29 @@ class CheckedRollouts(OnPolicyAlgorithm):
         prepared = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
         check_finite("observation", self._last_obs, self.num_timesteps)  # type: ignore[arg-type]
         return prepared
+
+    def _update_info_buffer(self, infos: list[dict[str, Any]], dones: np.ndarray | None = None) -> None:
+        super()._update_info_buffer(infos, dones)
+        if self.others_moved:
+            assert dones is not None
+            self._cut_off_episodes(infos, dones)
+
+    def _cut_off_episodes(self, infos: list[dict[str, Any]], dones: np.ndarray) -> None:
+        """
+        Let the step that was just made be the last one of its episode, cut off, as the environments have been moved since.
+
+        :param infos: of the step
+        :param dones: whether its episode ends with it, shape (n_envs,)
+        """
+        assert self._own_steps is not None
+        new_obs = self._own_steps.locals["new_obs"]  # that of SB3's loop, which goes on with it
+        for idx in np.flatnonzero(~dones):
+            last = {key: values[idx] for key, values in new_obs.items()} if isinstance(new_obs, dict) else new_obs[idx]
+            infos[idx].update({"terminal_observation": copy.deepcopy(last), "TimeLimit.truncated": True})
+        dones[:] = True
+        first = self._begin_episodes()
+        for key in new_obs if isinstance(new_obs, dict) else [...]:
+            new_obs[key] = first[key]
 
     def train(self) -> None:
         super().train()

@@ -168,6 +168,26 @@ def number_in(info: dict[str, Any], key: str, env_idx: int) -> float | None:
     return number
 
 
+def happened_in(info: dict[str, Any], key: str, env_idx: int = 0) -> bool | None:
+    """
+    Read from ``info`` whether something happened.
+
+    :param info: of one step
+    :return: whether the truth value, or the number of times, under ``key`` is not zero, or any of an array of them; None if
+        there is none: it is not measured
+    :raises ValueError: if it is anything else, such as text, of which any but the empty one would be true, or NaN
+    """
+    value = info.get(key)
+    if value is None:
+        return None
+    if not is_finite(value):
+        raise ValueError(
+            f"info[{key!r}] of environment {env_idx} must be a boolean, got {value!r}: mend the environment. Nothing of this "
+            "step was stored; the model can still be saved."
+        )
+    return bool(np.any(value))
+
+
 def check_step(
     observations: np.ndarray | dict[str, np.ndarray], rewards: np.ndarray, infos: list[dict[str, Any]], step: int
 ) -> None:

@@ -52,7 +52,7 @@ def read_report(info: dict[str, Any], action_space: spaces.Space, env_idx: int =
     :raises ValueError: if the human acted and the action is missing, of another shape, or NaN or infinite; names the key
     """
     flag = _first(info, FLAGS)
-    takeover = _truth(*flag, env_idx) if flag else _first(info, REPORTED_ACTIONS) is not None
+    takeover = truth(*flag, env_idx) if flag else _first(info, REPORTED_ACTIONS) is not None
     if not takeover:
         return Report(False, None, flag is not None or any(key in info for key in REPORTED_ACTIONS))
     found = _first(info, ACTIONS)
@@ -82,10 +82,12 @@ def _first(info: dict[str, Any], keys: Sequence[str]) -> tuple[str, Any] | None:
     return next(((key, named[key]) for key in keys if named.get(key) is not None), None)
 
 
-def _truth(key: str, value: Any, env_idx: int) -> bool:
+def truth(key: str, value: Any, env_idx: int) -> bool:
     """
     Read a flag.
 
+    :param key: of ``info``, for the message
+    :param value: of it
     :raises ValueError: for what is neither a boolean nor 0 or 1, nor an array of them
     """
     array = np.asarray(value)

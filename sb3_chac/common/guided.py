@@ -14,7 +14,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_chac.common import contract
 from sb3_chac.common.buffers import DualReplayBuffer
-from sb3_chac.common.checks import check_action_space, check_finite, number_in
+from sb3_chac.common.checks import check_action_space, check_policy, happened_in, number_in
 from sb3_chac.common.costs import EpisodeCosts, record_costs
 from sb3_chac.common.demonstrations import Dataset, load_demonstrations
 from sb3_chac.common.off_policy_algorithm import CheckedOffPolicyAlgorithm
@@ -35,7 +35,8 @@ COUNTS = (
 # Count -> keys of ``info`` that measure it, the first that is there counts. highway-env's ``crashed`` stays until the end
 EVENTS = {"collisions": ("collision", "crashed"), "departures": ("out_of_road",)}
 LASTING = ("crashed",)
-STATE_OF_ENVS = ("_wrapped", "_budget", "_expected", "_events_last", "_human_was_seen")
+WRAPPER_COUNTS = ("human_steps", "total_steps")  # of the InterventionWrapper, in ``info``
+STATE_OF_ENVS = ("_wrapped", "_budget", "_events_last", "_human_was_seen")
 
 
 class GuidedOffPolicyAlgorithm(CheckedOffPolicyAlgorithm):
@@ -52,6 +53,7 @@ class GuidedOffPolicyAlgorithm(CheckedOffPolicyAlgorithm):
     replay_buffer: DualReplayBuffer
 
     def _setup_model(self) -> None:
+        check_policy(type(self), self.policy_class, self.required_policy)
         if self.replay_buffer_class is None:
             self.replay_buffer_class = DualReplayBuffer
         if not issubclass(self.replay_buffer_class, DualReplayBuffer):
@@ -68,7 +70,6 @@ class GuidedOffPolicyAlgorithm(CheckedOffPolicyAlgorithm):
             self.measured: set[str] = set()  # what is logged of ``counts`` besides the takeovers
         self._wrapped: list[int] = []  # indices of the environments in which the human is asked
         self._budget: int | None = None
-        self._expected: list[tuple[int, int]] | None = None  # see ``_begin_step``
         self._forget_episodes()
         self.ep_cost_buffer: deque[float] = deque(maxlen=self._stats_window_size)
         with warnings.catch_warnings():
@@ -115,7 +116,12 @@ class GuidedOffPolicyAlgorithm(CheckedOffPolicyAlgorithm):
         check_action_space(wrapped.action_space)
         return wrapped
 
+    def _end_trajectories(self) -> None:
+        if self.replay_buffer is not None:
+            self.replay_buffer.end_trajectories()
+
     def _forget_episodes(self) -> None:
+        super()._forget_episodes()
         self.episode_costs = EpisodeCosts(self.n_envs)
         self.human_driving = np.zeros(self.n_envs, dtype=bool)
         self._events_last = np.zeros((self.n_envs, len(LASTING)), dtype=bool)
@@ -138,9 +144,6 @@ class GuidedOffPolicyAlgorithm(CheckedOffPolicyAlgorithm):
         progress_bar: bool = False,
     ) -> tuple[int, BaseCallback]:
         self.replay_buffer.end_trajectories()
-        if reset_num_timesteps or self._last_obs is None:  # the environments are about to be reset
-            self._forget_episodes()
-            self._expected = None
         assert self.env is not None
         self._wrapped = contract.wrapped_indices(self.env)
         self._human_was_seen = bool(self._wrapped)
@@ -200,7 +203,7 @@ class GuidedOffPolicyAlgorithm(CheckedOffPolicyAlgorithm):
         return contract.ask_wrappers(self.env, indices, method, *args)
 
     def _note_wrapper_states(self, states: dict[int, dict[str, int]]) -> None:
-        nothing = {"human_steps": 0, "total_steps": 0}
+        nothing = dict.fromkeys(WRAPPER_COUNTS, 0)
         self.wrapper_states = [states.get(idx, nothing) for idx in range(self.n_envs)]
 
     def _arm(self) -> None:
@@ -212,25 +215,13 @@ class GuidedOffPolicyAlgorithm(CheckedOffPolicyAlgorithm):
             self._ask_wrappers(self._wrapped, "disarm")
 
     def _begin_step(self) -> None:
-        """
-        Announce that the next step of the environments is one of the training. If somebody else has been in them since the
-        last one (an evaluation in the training environment), new episodes begin.
-        """
-        expected, self._expected = self._expected, [(-1, -1)] * len(self._wrapped)  # until the step is made
-        if self._announce_step() != expected and expected is not None:
-            self._start_over()
-            self._announce_step()
-
-    def _announce_step(self) -> list[tuple[int, int]]:
-        """
-        Announce the next step to the wrappers.
-
-        :return: numbers of steps and resets by others since the last one, of each wrapped environment
-        """
+        super()._begin_step()
         may_drive = self._may_drive()
         if len(may_drive) == len(self._wrapped):
-            return self._ask_wrappers(self._wrapped, "begin_step", True)
-        return [self._ask_wrappers([idx], "begin_step", idx in may_drive)[0] for idx in self._wrapped]
+            self._ask_wrappers(self._wrapped, "begin_step", True)
+        else:
+            for idx in self._wrapped:
+                self._ask_wrappers([idx], "begin_step", idx in may_drive)
 
     def _may_drive(self) -> list[int]:
         """
@@ -243,25 +234,9 @@ class GuidedOffPolicyAlgorithm(CheckedOffPolicyAlgorithm):
         left = max(0, self._budget - sum(state["human_steps"] for state in self.wrapper_states))
         return sorted(self._wrapped, key=lambda idx: not self.human_driving[idx])[:left]
 
-    def _start_over(self) -> None:
-        """Begin new episodes in all environments."""
-        assert self.env is not None
-        self.replay_buffer.end_trajectories()
-        self._forget_episodes()
-        self._last_obs = self.env.reset()  # type: ignore[assignment]
-        check_finite("observation", self._last_obs, self.num_timesteps)  # type: ignore[arg-type]
-        if self._vec_normalize_env is not None:
-            self._last_original_obs = self._vec_normalize_env.get_original_obs()
-
-    def _update_info_buffer(self, infos: list[dict[str, Any]], dones: np.ndarray | None = None) -> None:
-        super()._update_info_buffer(infos, dones)
-        assert dones is not None
-        self._expected = [(0, int(dones[idx])) for idx in self._wrapped]  # a VecEnv resets what is over
-
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
     ) -> tuple[np.ndarray, np.ndarray]:
-        self._begin_step()
         # A model that has learned before does not start with random actions again
         return super()._sample_action(0 if self._n_updates else learning_starts, action_noise, n_envs)
 
@@ -285,10 +260,15 @@ class GuidedOffPolicyAlgorithm(CheckedOffPolicyAlgorithm):
                     contract.check_reports(self.env, idx)
                 executed[idx] = contract.scaled(report.action, self.action_space, idx)
             start = info.get(contract.TAKEOVER_START)
-            if start is None:
-                start = report.takeover and not self.human_driving[idx]
-            own = {"takeover": report.takeover, "takeover_start": bool(start), "novice_action": buffer_action[idx]}
-            marked.append({**info, **own, **{name: number_in(info, name, idx) for name in ("cost", "takeover_cost")}})
+            starts = contract.truth(contract.TAKEOVER_START, start, idx) if start is not None else not self.human_driving[idx]
+            own = {
+                "takeover": report.takeover,
+                "takeover_start": report.takeover and starts,
+                "novice_action": buffer_action[idx],
+                **{name: number_in(info, name, idx) for name in ("cost", "takeover_cost")},
+                **{key: happened_in(info, key, idx) for keys in EVENTS.values() for key in keys},
+            }
+            marked.append({**info, **own})
         super()._store_transition(replay_buffer, executed, new_obs, reward, dones, marked)
         self.human_driving = np.array([report.takeover for report in reports]) & ~dones.astype(bool)
         self._human_was_seen |= any(report.says_so for report in reports)
@@ -299,9 +279,17 @@ class GuidedOffPolicyAlgorithm(CheckedOffPolicyAlgorithm):
         Check that an action arrived as it was sent.
 
         :param sent: scaled to [-1, 1]
-        :raises ValueError: if another action arrived where the human takes over than the one that was sent
+        :raises ValueError: if another action arrived where the human takes over than the one that was sent, or if one cannot
+            know as nothing is told of the takeover
         """
-        received = info.get(contract.RECEIVED_ACTION) if idx in self._wrapped else None  # else it is the environment's own
+        if idx not in self._wrapped:
+            return  # the key is the environment's own
+        if not {contract.TAKEOVER, contract.RECEIVED_ACTION, *WRAPPER_COUNTS} <= info.keys():
+            raise ValueError(
+                f"info of environment {idx} lacks what the InterventionWrapper told of the takeover: a wrapper above it "
+                "hands out an info of its own. Let it add to the info that it gets. Nothing of this step was stored."
+            )
+        received = info[contract.RECEIVED_ACTION]
         if received is None:
             return
         sent = np.asarray(self.policy.unscale_action(sent), np.float64)
@@ -322,16 +310,16 @@ class GuidedOffPolicyAlgorithm(CheckedOffPolicyAlgorithm):
                 counts["safety_cost"] += info["cost"]
                 counts["safety_cost_human"] += info["cost"] * takeover
             for name, keys in EVENTS.items():
-                key = next((key for key in keys if info.get(key) is not None), None)
+                begins = {key: self._happens(idx, key, bool(info[key]), bool(done)) for key in keys}
+                key = next((key for key in keys if info[key] is not None), None)
                 if key is not None:
                     self.measured.add(name)
-                    counts[name] += self._happens(idx, key, bool(info[key]), bool(done))
+                    counts[name] += begins[key]
         finished = self.episode_costs.add([info["cost"] for info in infos], dones)
         if self.safety_cost is not None:
             self.ep_cost_buffer.extend(finished)
         if self._wrapped:
-            names = ("human_steps", "total_steps")
-            self._note_wrapper_states({idx: {name: infos[idx][name] for name in names} for idx in self._wrapped})
+            self._note_wrapper_states({idx: {name: infos[idx][name] for name in WRAPPER_COUNTS} for idx in self._wrapped})
 
     def _happens(self, idx: int, key: str, value: bool, done: bool) -> bool:
         """

@@ -6,13 +6,13 @@ from typing import Any
 
 import numpy as np
 import torch as th
-from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import MaybeCallback
 from torch import nn
 
 from sb3_chac.common.checks import check_integer, check_range
 from sb3_chac.common.costs import EpisodeCosts, record_costs, step_costs
+from sb3_chac.common.own_steps import NoticesOthers
 
 
 class PIDLagrangian(nn.Module):
@@ -140,7 +140,7 @@ def constrained_advantages(advantages: th.Tensor, cost_advantages: th.Tensor, mu
     return (advantages - multiplier * cost_advantages) / (1 + multiplier)
 
 
-class CostConstrainedAlgorithm(BaseAlgorithm):
+class CostConstrainedAlgorithm(NoticesOthers):
     """
     Base of the algorithms under a constraint on the cost. It counts what the environments report in ``info["cost"]``, as it is
     (``VecNormalize`` leaves it alone), and holds the multiplier. To be derived from before an algorithm of SB3, which calls
@@ -215,9 +215,11 @@ class CostConstrainedAlgorithm(BaseAlgorithm):
     ) -> tuple[int, BaseCallback]:
         if reset_num_timesteps:
             self.ep_cost_buffer.clear()
-        if reset_num_timesteps or self._last_obs is None:  # the environments are about to be reset
-            self.episode_costs = EpisodeCosts(self.n_envs)
         return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
+
+    def _forget_episodes(self) -> None:
+        super()._forget_episodes()
+        self.episode_costs = EpisodeCosts(self.n_envs)
 
     def _count_costs(self, infos: list[dict[str, Any]], dones: np.ndarray) -> tuple[np.ndarray, list[float]]:
         """

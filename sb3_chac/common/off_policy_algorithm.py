@@ -9,6 +9,7 @@ import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.save_util import load_from_zip_file
@@ -28,11 +29,13 @@ from sb3_chac.common.checks import (
     check_step,
 )
 from sb3_chac.common.own_arrays import keep_last_observations
+from sb3_chac.common.own_steps import NoticesOthers
+from sb3_chac.common.saved_by import NamedAlgorithm
 
 SelfChecked = TypeVar("SelfChecked", bound="CheckedOffPolicyAlgorithm")
 
 
-class CheckedOffPolicyAlgorithm(OffPolicyAlgorithm):
+class CheckedOffPolicyAlgorithm(NamedAlgorithm, NoticesOthers, OffPolicyAlgorithm):
     """
     SB3's OffPolicyAlgorithm for continuous actions, which refuses bad arguments, checkpoints of other algorithms and
     observations or rewards that are not finite, each with one message, before anything is changed or stored.
@@ -112,6 +115,32 @@ class CheckedOffPolicyAlgorithm(OffPolicyAlgorithm):
                 f"policy: the critics of this {type(self).__name__} are all zeros: it was published to act, without what only "
                 "learns, and cannot go on learning. Evaluate it, or train a new one."
             )
+
+    def _forget_episodes(self) -> None:
+        super()._forget_episodes()
+        self._end_trajectories()
+
+    def _end_trajectories(self) -> None:
+        """Let no return of several steps run on from the last row of the replay buffer."""
+        buffer = self.replay_buffer
+        if buffer is not None and buffer.size() and getattr(buffer, "handle_timeout_termination", False):
+            last = buffer.pos - 1
+            buffer.timeouts[last] = np.maximum(buffer.timeouts[last], 1 - buffer.dones[last])
+
+    def _begin_step(self) -> None:
+        """Called before each step of the environments. New episodes begin if somebody else has moved them."""
+        if self.others_moved:
+            self._last_obs = self._begin_episodes()
+            if self._vec_normalize_env is not None:
+                self._last_original_obs = self._vec_normalize_env.get_original_obs()
+            if self.action_noise is not None:
+                self.action_noise.reset()
+
+    def _sample_action(
+        self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
+    ) -> tuple[np.ndarray, np.ndarray]:
+        self._begin_step()
+        return super()._sample_action(learning_starts, action_noise, n_envs)
 
     def _store_transition(
         self,

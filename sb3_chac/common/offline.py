@@ -18,6 +18,7 @@ from sb3_chac.common.arguments import check_policy_kwargs, checked
 from sb3_chac.common.checked_env import check_env_is_there
 from sb3_chac.common.checks import check_integer, check_learning_rate, check_policy, check_range
 from sb3_chac.common.demonstrations import Dataset, Demonstrations, check_imitable, load_demonstrations, missing_dataset
+from sb3_chac.common.saved_by import NamedAlgorithm
 from sb3_chac.common.utils import fix_statistics
 
 SelfOffline = TypeVar("SelfOffline", bound="OfflineAlgorithm")
@@ -85,7 +86,7 @@ class DatasetSampler:
         return self.order[self.position - self.batch_size : self.position]
 
 
-class OfflineAlgorithm(BaseAlgorithm):
+class OfflineAlgorithm(NamedAlgorithm):
     """
     Base of the algorithms that learn from a dataset, without acting. Their timesteps are gradient steps: ``learn(n)`` makes n
     of them and calls the callbacks after each, so that evaluation, checkpoints, pruning and the progress bar work as usual.

@@ -22,7 +22,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.common.vec_env.base_vec_env import CloudpickleWrapper
 from tqdm import tqdm
 
-from sb3_chac.common.checks import UnsupportedActionSpace, check_integer, number_in, number_or_nan
+from sb3_chac.common.checks import UnsupportedActionSpace, check_integer, happened_in, number_in, number_or_nan
 from sb3_chac.common.contract import (
     NOVICE_ACTION,
     TAKEOVER,
@@ -255,12 +255,12 @@ class Recorder(Runner):
         """
         report = read_report(info, action_space)
         has_novice = report.says_so or someone_watches
-        cost, is_success = number_in(info, "cost", 0), info.get("is_success")
+        cost, is_success = number_in(info, "cost", 0), happened_in(info, "is_success")
         return {
             TAKEOVER: report.takeover or not has_novice,
             **({NOVICE_ACTION: np.array(action)} if has_novice else {}),
             **({} if cost is None else {"cost": cost}),
-            **({} if is_success is None else {"is_success": bool(is_success)}),
+            **({} if is_success is None else {"is_success": is_success}),
         }
 
 

@@ -17,7 +17,7 @@ from stable_baselines3.common.utils import FloatSchedule, check_for_correct_spac
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 import sb3_chac.envs  # noqa: F401  (registers our environments)
-from sb3_chac.common.checks import is_finite, number_or_nan, real_numbers
+from sb3_chac.common.checks import happened_in, is_finite, number_or_nan, real_numbers
 from sb3_chac.envs import REHEARSALS
 from sb3_chac.envs.driving.corridors import corridors_remedy
 from sb3_chac.human.experts import ModelExpert, make_expert
@@ -285,7 +285,7 @@ class Runner:
         observation = self.reset(number)
         info: dict[str, Any] = {}
         rewards, costs, positions, actions = [0.0], [0.0], [self._position()], []
-        terminated = truncated = False
+        terminated = truncated = tells_cost = False
         on_step()
         while not (terminated or truncated):
             action = self._act(observation)
@@ -293,6 +293,7 @@ class Runner:
             observation, reward, terminated, truncated, info = self.env.step(action)
             rewards.append(number_or_nan(reward))
             costs.append(0.0 if info.get("cost") is None else number_or_nan(info["cost"]))
+            tells_cost |= info.get("cost") is not None
             positions.append(self._position())
             on_step()
         record = {
@@ -300,9 +301,9 @@ class Runner:
             "seed": self.seed(number),
             "return": math.fsum(rewards),
             "steps": len(rewards) - 1,
-            **({"cost": math.fsum(costs)} if info.get("cost") is not None else {}),
-            **({"success": bool(info["is_success"])} if "is_success" in info else {}),
-            **({"route_completion": number_or_nan(info["route_completion"])} if "route_completion" in info else {}),
+            **({"cost": math.fsum(costs)} if tells_cost else {}),
+            **({"success": success} if (success := happened_in(info, "is_success")) is not None else {}),
+            **({} if info.get("route_completion") is None else {"route_completion": number_or_nan(info["route_completion"])}),
             "terminated": bool(terminated),
             "truncated": bool(truncated),
         }

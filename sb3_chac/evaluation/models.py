@@ -16,6 +16,7 @@ from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_chac.common.checkpoints import statistics
+from sb3_chac.common.saved_by import name_in
 from sb3_chac.envs import ENVIRONMENTS
 from sb3_chac.envs.driving.corridors import corridors_remedy
 from sb3_chac.evaluation.episodes import NotEvaluable, SavedModel, control_of
@@ -59,7 +60,9 @@ def find_algorithm(path: Path, algo: str | None) -> tuple[Path, str, type[BaseAl
         module = data["policy_class"]["__module__"]
     except (zipfile.BadZipFile, KeyError, ValueError, TypeError) as error:
         raise NotEvaluable(f"{path} is not a model saved by Stable-Baselines3.") from error
-    savers = possible_algorithms(module, set(data), utils.ALGOS)
+    saver = name_in(data)
+    named = [name for name, algorithm in utils.ALGOS.items() if algorithm.__name__ == saver]
+    savers = named or possible_algorithms(module, set(data), utils.ALGOS)
     if algo is None:
         algo = choose_by_path(path, savers or list(utils.ALGOS))
     elif savers and algo not in savers:

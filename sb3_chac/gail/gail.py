@@ -17,7 +17,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_chac.common.arguments import check_policy_kwargs, checked
 from sb3_chac.common.checked_rollouts import CheckedRollouts
-from sb3_chac.common.checks import check_integer, check_learning_rate, check_range
+from sb3_chac.common.checks import check_integer, check_learning_rate, check_policy, check_range
 from sb3_chac.common.demonstrations import Dataset, Demonstrations, check_imitable, load_demonstrations, missing_dataset
 from sb3_chac.common.utils import minimize
 from sb3_chac.gail.discriminator import Discriminator, discriminator_loss, imitation_rewards
@@ -184,6 +184,7 @@ class GAIL(CheckedRollouts, PPO):
 
         :raises ValueError: names the argument and the remedy
         """
+        check_policy(type(self), self.policy_class, ActorCriticPolicy)
         check_policy_kwargs("policy_kwargs", self.policy_class, self.policy_kwargs, ("pi", "vf"))
         check_policy_kwargs("disc_kwargs", Discriminator, self.disc_kwargs)
         check_learning_rate("learning_rate", self.learning_rate)

@@ -116,7 +116,6 @@ class InterventionWrapper(contract.TakeoverWrapper, RecordConstructorArgs):
         self._armed = False
         self._step_by_step = False
         self._is_granted = self._may_drive = False  # of the next step, see ``begin_step``
-        self._foreign_steps = self._resets = 0  # since the last one that was granted
         self._has_to_start = False
         self._was_reported = False  # a takeover, by the environment, in the step before
         self._state = ControlState.AUTONOMOUS
@@ -177,18 +176,14 @@ class InterventionWrapper(contract.TakeoverWrapper, RecordConstructorArgs):
             self._start_now_or_when_granted()
         self._armed = True
 
-    def begin_step(self, may_drive: bool) -> tuple[int, int]:
+    def begin_step(self, may_drive: bool) -> None:
         """
         Announce that the next step is one of the training: nobody else's (an evaluation in the same environment) is watched,
         driven or counted by the human.
 
         :param may_drive: whether the human may drive it
-        :return: number of steps and resets since the last one that were not announced
         """
-        made = self._foreign_steps, self._resets
-        self._foreign_steps = self._resets = 0
         self._is_granted, self._may_drive = True, may_drive
-        return made
 
     def disarm(self) -> None:
         """End a takeover and a pause; from the next step on the wrapper is inert. The counts are kept."""
@@ -229,7 +224,6 @@ class InterventionWrapper(contract.TakeoverWrapper, RecordConstructorArgs):
         self._observation = None
         self._on("hand back")
         self._was_reported = False
-        self._resets += 1
         observation, info = self.env.reset(seed=seed, options=options)
         self._observation = copy.deepcopy(observation)
         if seed is not None:
@@ -240,7 +234,6 @@ class InterventionWrapper(contract.TakeoverWrapper, RecordConstructorArgs):
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         is_granted, self._is_granted = self._is_granted, False
-        self._foreign_steps += not is_granted
         watches = self._armed and (is_granted or not self._step_by_step)
         if watches and self._has_to_start:
             self._has_to_start = False

@@ -17,7 +17,7 @@ from torch.nn import functional as F
 
 from sb3_chac.common.arguments import check_policy_kwargs, checked
 from sb3_chac.common.checked_rollouts import CheckedRollouts
-from sb3_chac.common.checks import check_learning_rate, check_range
+from sb3_chac.common.checks import check_learning_rate, check_policy, check_range
 from sb3_chac.common.lagrange import CostConstrainedAlgorithm, constrained_advantages
 from sb3_chac.common.utils import detach_distributions
 from sb3_chac.ppo_lag.buffers import CostDictRolloutBuffer, CostRolloutBuffer, CostRolloutBufferSamples
@@ -191,11 +191,7 @@ class PPOLag(CostConstrainedAlgorithm, CheckedRollouts, PPO):
 
         :raises ValueError: names the argument and the remedy
         """
-        if not issubclass(self.policy_class, CostActorCriticPolicy):
-            raise ValueError(
-                f"policy: PPOLag needs a CostActorCriticPolicy, got {self.policy_class.__name__} "
-                f"(of {self.policy_class.__module__}). If it came from a checkpoint, load that with the class that saved it."
-            )
+        check_policy(type(self), self.policy_class, CostActorCriticPolicy)
         if self.rollout_buffer_class is not None and not issubclass(self.rollout_buffer_class, CostRolloutBuffer):
             raise ValueError(
                 f"rollout_buffer_class must derive from CostRolloutBuffer, got {self.rollout_buffer_class.__name__}: "
