@@ -16,7 +16,6 @@ key to the page showing that the driving end has it; and "applied", until the pa
 It wants a machine with two cores that does nothing else; the load average is in the rows.
 """
 
-import argparse
 import asyncio
 import os
 import random
@@ -380,8 +379,7 @@ def pictures_of_the_page() -> None:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("command", choices=["drive", "browser", "report", "pictures"])
+    parser = lab.make_parser(__doc__, ["drive", "browser", "report", "pictures"])
     parser.add_argument("--env", default="SafeDrive-v0", metavar="ID")
     parser.add_argument("--minutes", type=float, default=10.0)
     arguments = parser.parse_args()
