@@ -186,7 +186,8 @@ def test_a_killed_suite_goes_on_from_checkpoints_and_takes_its_processes_along(t
 
 @pytest.mark.parametrize("number", [pytest.param(signal.SIGTERM, marks=pytest.mark.slow), signal.SIGINT])
 def test_a_signal_ends_the_suite_and_its_jobs_in_good_order(tmp_path, number):
-    arguments = command(tmp_path, "run", "--rows", "pvp", "dpvp", "--seeds", "1", "--scale", "0.02", "--jobs", "1")
+    # Long enough not to end before the signal
+    arguments = command(tmp_path, "run", "--rows", "pvp", "dpvp", "--seeds", "1", "--scale", "1", "--jobs", "1")
     process = subprocess.Popen(arguments, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
     folder = tmp_path / "work" / "pvp-0"
     begun = folder / "logs" / "pvp" / "SafeDrive-v0_1" / "progress.csv"
