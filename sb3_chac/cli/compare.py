@@ -122,7 +122,6 @@ def with_human(methods: list[Method]) -> list[Method]:
     """
     Select the methods that a human helped.
 
-    :return: the methods that a human helped
     :raises NotPlottable: if there is none
     """
     helped = [method for method in methods if any(curves.over_human_steps(run) for run in method.runs)]

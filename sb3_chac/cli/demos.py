@@ -171,11 +171,7 @@ def run_record(args: argparse.Namespace) -> None:
 
 
 def find_model(path: Path, env_id: str, env_kwargs: dict[str, Any]) -> tuple[BaseAlgorithm, VecNormalize | None]:
-    """
-    Load a model with the statistics of its observations.
-
-    :return: the model, and the statistics that its observations are normalized with, if any
-    """
+    """Load a model, and the statistics that its observations are normalized with, if any."""
     path, algo, algorithm = find_algorithm(path, None)
     env = make_env(env_id, env_kwargs)
     model = load_model(path, algo, algorithm, env)

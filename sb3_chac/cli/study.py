@@ -102,7 +102,7 @@ def check_drives(protocol: Any, folder: Path) -> None:
 
 class Study:
     """
-    What one participant goes through.
+    Parts of a study that one participant goes through.
 
     :param protocol: of the study
     :param participant: whose folder is in use
@@ -118,7 +118,7 @@ class Study:
 
     @property
     def has_driven(self) -> bool:
-        """Whether there is an episode of a condition."""
+        """Tell whether there is an episode of a condition."""
         return any(self.participant.episodes(name) for name in self.protocol.conditions)
 
     def serve(self, args: argparse.Namespace) -> None:

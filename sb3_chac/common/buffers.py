@@ -42,7 +42,6 @@ def take_rows(observations: th.Tensor | TensorDict, rows: th.Tensor) -> Any:
 
     :param observations: batch of observations, possibly a dictionary
     :param rows: indices
-    :return: the observations of these rows
     """
     if isinstance(observations, dict):
         return {key: value[rows] for key, value in observations.items()}
@@ -188,11 +187,7 @@ class DualReplayBuffer(ReplayBuffer):
             row |= {name: np.zeros(1, np.float32) for name in SCALARS if name not in row}
 
     def size(self) -> int:
-        """
-        Count the transitions of both stores.
-
-        :return: number of transitions in both stores
-        """
+        """Count the transitions of both stores."""
         return len(self.novice) + len(self.human)
 
     def reset(self) -> None:

@@ -99,7 +99,7 @@ class Browser:
         self.go_away()
 
     def go_away(self) -> None:
-        """Whoever is there looks elsewhere, until the next message."""
+        """Take it that whoever is there looks elsewhere, until the next message."""
         self.ramps.stop()
         self.gamepad: tuple[float, ...] | None = None
         self.touch: tuple[float, ...] | None = None
