@@ -16,7 +16,6 @@ key to the page showing that the driving end has it; and "applied", until the pa
 It wants a machine with two cores that does nothing else; the load average is in the rows.
 """
 
-import argparse
 import asyncio
 import os
 import random
@@ -25,6 +24,7 @@ import sys
 import tempfile
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -209,22 +209,10 @@ def measure_browser(env: str, minutes: float) -> None:
             rows[:] = [row | {"ms": round(row["ms"], 2)} | facts | versions for row in rows]
             browser.close()
 
-    async def all_of_it() -> None:
-        async with server.listening():
-            run.thread.start()
-            try:
-                await asyncio.to_thread(drive_in_chromium)
-            finally:
-                run.drive.quit()
-            while not run.is_over:
-                await asyncio.sleep(0.1)
-
     with tempfile.TemporaryDirectory() as folder:
         run = make_run(env, folder, device)
         server = Server(run.drive, device, Address("127.0.0.1", 0))
-        asyncio.run(all_of_it())
-        if run.error is not None:
-            raise run.error
+        visit(run, server, drive_in_chromium)
     lab.write(RESULTS / "browser.csv", rows)
     report()
 
@@ -318,6 +306,28 @@ def pictures() -> None:
         pictures_of_the_page()
 
 
+def visit(run: CockpitRun, server: Any, visitor: Callable[[], None]) -> None:
+    """
+    :param run: that is driven
+    :param server: of its page
+    :param visitor: opens the page and drives, in a thread of its own; then the drive ends
+    """
+
+    async def serve() -> None:
+        async with server.listening():
+            run.thread.start()
+            try:
+                await asyncio.to_thread(visitor)
+            finally:
+                run.drive.quit()
+            while not run.is_over:
+                await asyncio.sleep(0.1)
+
+    asyncio.run(serve())
+    if run.error is not None:
+        raise run.error
+
+
 def chromium() -> str | None:
     """
     :return: path of the browser
@@ -360,28 +370,15 @@ def pictures_of_the_page() -> None:
                 page.close()
             browser.close()
 
-    async def all_of_it() -> None:
-        async with server.listening():
-            run.thread.start()
-            try:
-                await asyncio.to_thread(take_pictures)
-            finally:
-                run.drive.quit()
-            while not run.is_over:
-                await asyncio.sleep(0.1)
-
     with tempfile.TemporaryDirectory() as folder:
         agent = Path(__file__).parent / "agents" / "dpvp-SafeDrive-v0.zip"
         run = make_run("SafeDrive-v0", folder, device, "--algo", "dpvp", "--trained-agent", str(agent))
         server = Server(run.drive, device, Address("127.0.0.1", 0))
-        asyncio.run(all_of_it())
-        if run.error is not None:
-            raise run.error
+        visit(run, server, take_pictures)
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("command", choices=["drive", "browser", "report", "pictures"])
+    parser = lab.make_parser(__doc__, ["drive", "browser", "report", "pictures"])
     parser.add_argument("--env", default="SafeDrive-v0", metavar="ID")
     parser.add_argument("--minutes", type=float, default=10.0)
     arguments = parser.parse_args()

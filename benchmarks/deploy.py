@@ -11,7 +11,6 @@ benchmarks/results/deploy and goes on where it was stopped.
 A simulated clock ticks in ``link`` and ``cuts``, so that their rows do not depend on the machine.
 """
 
-import argparse
 import gc
 import platform
 import resource
@@ -302,8 +301,7 @@ def report(out: Path) -> None:
 
 def main() -> None:
     """Run one of the commands."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("command", choices=("export", "latency", "link", "cuts", "report"))
+    parser = lab.make_parser(__doc__, ("export", "latency", "link", "cuts", "report"))
     parser.add_argument("--out", type=Path, default=HERE / "results" / "deploy")
     parser.add_argument("--policies", type=Path, default=Path("logs/deploy"), help="folder of the exported agents")
     parser.add_argument("-n", type=int, help="observations, decisions, maps or cuts")

@@ -283,13 +283,12 @@ def slim(source: Path, target: Path, networks: tuple[str, ...]) -> None:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("command", choices=["run", "report", "agents", "cost"])
+    parser = lab.make_parser(__doc__, ["run", "report", "agents", "cost"])
     parser.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS))
-    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
+    lab.add_seeds(parser)
     parser.add_argument("--every", type=int, default=10_000, help="steps between evaluations")
     parser.add_argument("--steps", type=int, default=200_000, help="most steps of a run, to stop the long ones earlier")
-    parser.add_argument("--jobs", type=int, default=2, help="processes at once, one torch thread each")
+    lab.add_jobs(parser)
     parser.add_argument("--env", choices=RESULTS, default="SafeDrive-v0")
     parser.add_argument("--results", type=Path, help="default: see above")
     parser.add_argument("--models", type=Path, help="not committed; default: benchmarks/models/<env>")

@@ -210,11 +210,10 @@ def report(args: argparse.Namespace) -> None:
 
 if __name__ == "__main__":
     commands = {f.__name__: f for f in (rounds, gail, report)}
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("command", choices=commands)
-    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
+    parser = lab.make_parser(__doc__, commands)
+    lab.add_seeds(parser)
     parser.add_argument("--envs", nargs="+", choices=TASKS, default=list(TASKS), help="of GAIL")
-    parser.add_argument("--jobs", type=int, default=2, help="processes at once, one torch thread each")
+    lab.add_jobs(parser)
     parser.add_argument("--work", type=Path, default=HERE / "models" / "imitation")
     arguments = parser.parse_args()
     commands[arguments.command](arguments)

@@ -191,11 +191,10 @@ def report(args: argparse.Namespace) -> None:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("command", choices=["run", "report"])
+    parser = lab.make_parser(__doc__, ["run", "report"])
     parser.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS))
-    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
-    parser.add_argument("--jobs", type=int, default=2, help="processes at once, one torch thread each")
+    lab.add_seeds(parser)
+    lab.add_jobs(parser)
     parser.add_argument("--folder", type=Path, default=RESULTS)
     arguments = parser.parse_args()
     {"run": run_all, "report": report}[arguments.command](arguments)

@@ -37,33 +37,13 @@ COLUMNS = {  # -> digits in the report
 }
 
 
-def drive(env, driver, scenario: int) -> dict:
-    observation, _ = env.reset(options={"scenario": scenario})
-    driver.reset(scenario)
-    done, total, contact_cost = False, 0.0, 0.0
-    while not done:
-        observation, reward, terminated, truncated, info = env.step(driver(observation))
-        done, total, contact_cost = terminated or truncated, total + reward, contact_cost + info["contact_cost"]
-    return {
-        "scenario": scenario,
-        "return": round(total, 2),
-        "cost": int(info["episode_cost"]),
-        "contact_cost": int(contact_cost),
-        "success": int(info["is_success"]),
-        "out_of_road": int(info["out_of_road"]),
-        "route_completion": round(info["route_completion"], 4),
-        "steps": env.steps,
-    }
-
-
 def drive_some(preset: str, name: str, scenarios: list[int]) -> list[dict]:
     th.set_num_threads(1)
     env = gym.make("MetaDriveSafety-v0", preset=preset, headless=True).unwrapped
     try:
         driver = env.scripted_driver(name)
-        return [
-            {"preset": preset, "driver": name, **drive(env, driver, scenario), "versions": VERSIONS} for scenario in scenarios
-        ]
+        rows = [lab.drive(env, driver, scenario, "contact_cost", "contact_cost") for scenario in scenarios]
+        return [{"preset": preset, "driver": name, **row, "versions": VERSIONS} for row in rows]
     finally:
         env.close()
 
@@ -113,9 +93,8 @@ def report(args: argparse.Namespace) -> None:
 
 if __name__ == "__main__":
     commands = {f.__name__: f for f in (drivers, report, observations)}
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("command", choices=commands)
+    parser = lab.make_parser(__doc__, commands)
     parser.add_argument("--drivers", nargs="+", choices=DRIVERS, default=list(DRIVERS))
-    parser.add_argument("--jobs", type=int, default=2, help="processes at once, one torch thread each")
+    lab.add_jobs(parser)
     arguments = parser.parse_args()
     commands[arguments.command](arguments)

@@ -11,7 +11,6 @@ temporal difference, so that its conservative weight of 5 is 2.5 here. Rows are 
 benchmarks/results/parity/parity.csv; the datasets are committed beside it.
 """
 
-import argparse
 import time
 from pathlib import Path
 from typing import Any
@@ -170,10 +169,9 @@ def report() -> None:
 LIBRARIES = {"ours": ours, "d3rlpy": d3rlpy}
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("command", choices=["data", *LIBRARIES, "report"])
+    parser = lab.make_parser(__doc__, ["data", *LIBRARIES, "report"])
     parser.add_argument("--algos", nargs="+", choices=DATASETS, default=list(DATASETS))
-    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
+    lab.add_seeds(parser)
     args = parser.parse_args()
     if args.command in ("data", "report"):
         {"data": data, "report": report}[args.command]()

@@ -149,8 +149,7 @@ def report(args: argparse.Namespace) -> None:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("command", choices=["train", "test", "report"])
+    parser = lab.make_parser(__doc__, ["train", "test", "report"])
     parser.add_argument("--algo", choices=("dpvp", "chac"), default="dpvp")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--steps", type=int, default=100_000, help="(default: %(default)s)")

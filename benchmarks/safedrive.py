@@ -79,23 +79,8 @@ class RandomDriver:
 
 
 def drive(env, driver, scenario: int) -> dict:
-    observation, _ = env.reset(options={"scenario": scenario})
-    driver.reset(scenario)
-    done, total, contacts = False, 0.0, 0
-    while not done:
-        observation, reward, terminated, truncated, info = env.step(driver(observation))
-        done, total, contacts = terminated or truncated, total + reward, contacts + info["contact"]
-    return {
-        "scenario": scenario,
-        "return": round(total, 2),
-        "cost": int(info["episode_cost"]),
-        "contact_steps": contacts,
-        "success": int(info["is_success"]),
-        "out_of_road": int(info["out_of_road"]),
-        "route_completion": round(info["route_completion"], 4),
-        "steps": env.steps,
-        "route_length": round(env.map.length, 1),
-    }
+    row = lab.drive(env, driver, scenario, "contact", "contact_steps")
+    return row | {"route_length": round(env.map.length, 1)}
 
 
 def drivers(args: argparse.Namespace) -> None:
@@ -304,10 +289,9 @@ def report(args: argparse.Namespace) -> None:
 
 if __name__ == "__main__":
     commands = {f.__name__: f for f in (drivers, speed, traffic, takeovers, learn, report)}
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("command", choices=commands)
-    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
+    parser = lab.make_parser(__doc__, commands)
+    lab.add_seeds(parser)
     parser.add_argument("--steps", type=int, default=LEARN_STEPS)
-    parser.add_argument("--jobs", type=int, default=2, help="processes at once, one torch thread each")
+    lab.add_jobs(parser)
     arguments = parser.parse_args()
     commands[arguments.command](arguments)

@@ -10,12 +10,12 @@ processors with AMX or AVX512-BF16.
 
 import argparse
 import csv
-import importlib.metadata
 import platform
 import time
 from pathlib import Path
 
 import gymnasium as gym
+import lab
 import numpy as np
 import torch as th
 from gymnasium import spaces
@@ -90,7 +90,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=RESULTS)
     args = parser.parse_args()
     th.set_num_threads(1)
-    versions = " ".join(f"{name}={importlib.metadata.version(name)}" for name in ("torch", "stable-baselines3", "sb3_chac"))
+    versions = lab.versions("torch", "stable-baselines3", "sb3_chac")
 
     args.out.parent.mkdir(parents=True, exist_ok=True)
     with args.out.open("w", newline="") as file:

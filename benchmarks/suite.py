@@ -12,13 +12,13 @@ benchmarks/results/<suite>-<scale>/<row>-<seed>/ when it is done; checkpoints an
 """
 
 import argparse
-import csv
 import signal
 import sys
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from pathlib import Path
 from types import FrameType
 
+import lab
 import suite_job
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from suite_job import Job, Outcome, Row
@@ -89,9 +89,9 @@ class Results:
         :raises ValueError: if a line of it is damaged
         """
         path = self.path(job) / f"{kind}.csv"
-        with path.open(newline="") as file:
-            reader = csv.DictReader(file)
-            rows = list(reader)
+        if not path.is_file():
+            raise FileNotFoundError(path)
+        rows = lab.read(path)
         expected = {"method": job.row.name, "seed": str(job.seed)}
         for line, row in enumerate(rows, 2):
             if None in row or None in row.values() or any(row.get(key) != value for key, value in expected.items()):
@@ -166,7 +166,8 @@ class OnRay:
             ray.init(address=address, log_to_driver=False)
         except (ConnectionError, ValueError, RuntimeError) as error:
             sys.exit(f"--ray: no Ray cluster answers at {address}: {error}\nStart one with 'ray start --head'.")
-        ray.cloudpickle.register_pickle_by_value(suite_job)  # the workers need not have this folder
+        for module in (lab, suite_job):  # the workers need not have this folder
+            ray.cloudpickle.register_pickle_by_value(module)
         self.ray = ray
         self.remote = ray.remote(num_cpus=1, max_retries=RETRIES)(suite_job.run)
 
@@ -263,8 +264,7 @@ def report(args: argparse.Namespace) -> None:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("command", choices=["run", "report"])
+    parser = lab.make_parser(__doc__, ["run", "report"])
     parser.add_argument("--suite", choices=SUITES, default="table1")
     names = [row.name for row in ROWS]
     parser.add_argument("--rows", nargs="+", choices=names, default=names, metavar="ROW", help=f"of {', '.join(names)}")

@@ -5,13 +5,10 @@ that has sb3_chac. It can be stopped at any time; run again in the same ``work``
 """
 
 import contextlib
-import csv
 import ctypes
 import fcntl
 import hashlib
-import importlib.metadata
 import inspect
-import io
 import json
 import os
 import shutil
@@ -21,6 +18,7 @@ import sys
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import lab
 import numpy as np
 import yaml
 
@@ -37,6 +35,7 @@ VALIDATION_EPISODES, EVALUATIONS, CHECKPOINTS = 10, 10, 20
 # the defaults of the algorithm
 BUDGETS = {"n_timesteps", "budget", "switch_after", "prefit_steps", "warm_up_steps", "round_human_steps"}
 LEAST = 50  # of any of them
+PACKAGES = ("sb3_chac", "torch", "stable-baselines3", "gymnasium")
 SIMULATORS = {"SafeDrive-v0": "highway-env", "MetaDriveSafety-v0": "metadrive-simulator"}
 TEST_MAPS = range(1000, 1050)
 DRIVES = (1003, 1012, 1027)  # maps of which every step is kept, if the job keeps any
@@ -156,17 +155,18 @@ def run_in(folder: Path, job: Job) -> Outcome:
         used["total_steps"] = steps(model)[0]
 
     run = {"method": job.row.name, "seed": job.seed}
-    facts = {"fingerprint": fingerprint(job), "versions": versions(job.env)}
+    versions = lab.versions(*PACKAGES, SIMULATORS[job.env], "numpy")
+    facts = {"fingerprint": fingerprint(job), "versions": versions}
     columns = ("scenario", "return", "cost", "success", "route_completion", "steps")
-    files = {"episodes": table([run | {key: record[key] for key in columns} | used | facts for record in test["records"]])}
+    episodes = [run | {key: record[key] for key in columns} | used | facts for record in test["records"]]
+    files = {"episodes": lab.to_csv(episodes)}
     if curves:
         points = [(quantity, *point) for quantity in CURVES for point in thinned(curves.get(quantity, np.zeros((0, 3))))]
-        files["curves"] = table([run | {"quantity": q, "step": int(s), "value": round(v, 4)} for q, s, v in points])
+        files["curves"] = lab.to_csv([run | {"quantity": q, "step": int(s), "value": round(v, 4)} for q, s, v in points])
     if job.keeps_drives:
         drives = folder / "drives.csv"
         call(folder, *who, "--scenarios", ",".join(map(str, DRIVES)), "--steps", drives)
-        with drives.open(newline="") as file:
-            files["drives"] = table([run | row for row in csv.DictReader(file)])
+        files["drives"] = lab.to_csv([run | row for row in lab.read(drives)])
     return Outcome(files, model.read_bytes() if model else b"")
 
 
@@ -305,19 +305,3 @@ def thinned(curve: np.ndarray) -> np.ndarray:
     """
     chosen = np.unique(np.linspace(0, len(curve) - 1, min(len(curve), POINTS)).round().astype(int))
     return curve[chosen, :2]
-
-
-def table(rows: list[dict[str, Any]]) -> str:
-    """
-    :return: as CSV
-    """
-    text = io.StringIO()
-    writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    return text.getvalue()
-
-
-def versions(env: str) -> str:
-    names = ("torch", "stable-baselines3", "gymnasium", SIMULATORS[env], "numpy")
-    return " ".join([f"sb3_chac={sb3_chac.__version__}", *(f"{name}={importlib.metadata.version(name)}" for name in names)])

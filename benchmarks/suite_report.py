@@ -1,6 +1,5 @@
 """RESULTS.md and its pictures, from the CSVs of the suite alone."""
 
-import warnings
 from collections import defaultdict
 from collections.abc import Iterable
 from pathlib import Path
@@ -10,7 +9,6 @@ import gymnasium as gym
 import numpy as np
 import suite_job
 from matplotlib.figure import Figure
-from rliable.library import get_interval_estimates
 from suite_job import Job
 
 import sb3_chac.envs  # noqa: F401  (registers our environments)
@@ -21,7 +19,6 @@ if TYPE_CHECKING:
 
 HERE = Path(__file__).parent
 METRICS = {"return": ("return", 0), "cost": ("safety cost", 2), "success": ("success", 2)}  # name -> title, digits
-RESAMPLES = 2000
 REMARKS = "remarks.md"  # beside the CSVs, written by hand: reasons for what contradicts the paper
 
 
@@ -135,9 +132,11 @@ def write(suite: str, scale: float, jobs: list[Job], results: "Results") -> None
         "resampled map by map). In italics the paper's figures, which are MetaDrive's at the full budgets.",
         "",
         *outdated(methods),
-        *main_table(methods),
+        main_table(methods),
         "",
-        *claims(methods),
+        "## The paper's ordering",
+        "",
+        claims(methods),
         "",
     ]
     remarks = results.folder / REMARKS
@@ -171,11 +170,9 @@ def outdated(methods: dict[str, Method]) -> list[str]:
     )
 
 
-def main_table(methods: dict[str, Method]) -> list[str]:
-    lines = [
-        "| method | seeds | human data | total data | training cost | return | safety cost | success | paper: r. / c. / s. |",
-        "|---" * 9 + "|",
-    ]
+def main_table(methods: dict[str, Method]) -> str:
+    head = ["method", "seeds", "human data", "total data", "training cost", "return", "safety cost", "success"]
+    table = [[*head, "paper: r. / c. / s."]]
     for name, method in methods.items():
         cells = [f"{method.counts(key).mean():,.0f}" for key in ("human_steps", "total_steps", "training_cost")]
         for metric, (_, digits) in METRICS.items():
@@ -187,8 +184,8 @@ def main_table(methods: dict[str, Method]) -> list[str]:
             cells.append(cell)
         figures = PAPER.get(name)
         cells.append("*" + " / ".join(f"{value:g}" for value in figures.value.values()) + "*" if figures else "")
-        lines.append(f"| {method.title} | {len(method.jobs)} | " + " | ".join(cells) + " |")
-    return lines
+        table.append([method.title, str(len(method.jobs)), *cells])
+    return curves.markdown(table)
 
 
 def interval(scores: np.ndarray) -> tuple[float, float]:
@@ -196,17 +193,13 @@ def interval(scores: np.ndarray) -> tuple[float, float]:
     :param scores: shape (n_seeds, n_maps)
     :return: 95 % bootstrap interval of the mean
     """
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", FutureWarning)  # rliable's use of arch
-        np.random.seed(0)  # rliable draws from numpy's global generator, whatever random_state it is given
-        _, intervals = get_interval_estimates({"": scores}, lambda x: np.array([x.mean()]), reps=RESAMPLES)
-    low, high = intervals[""][:, 0]
-    return float(low), float(high)
+    _, low, high = curves.estimate(scores, lambda x: np.array([x.mean()]))
+    return low, high
 
 
-def claims(methods: dict[str, Method]) -> list[str]:
+def claims(methods: dict[str, Method]) -> str:
     """What of the paper's ordering holds here, and what does not."""
-    lines = ["## The paper's ordering", "", "| claim | success | safety cost |", "|---|---|---|"]
+    table = [["claim", "success", "safety cost"]]
     for better, worse in CLAIMS:
         if better not in methods or worse not in methods:
             continue
@@ -216,8 +209,8 @@ def claims(methods: dict[str, Method]) -> list[str]:
             theirs = sign * (PAPER[better].value[metric] - PAPER[worse].value[metric])
             agrees = "as in the paper" if ours * theirs > 0 else "equal here" if ours == 0 else "**contradicts the paper**"
             cells.append(f"{sign * ours:+.2f} (paper {sign * theirs:+.2f}): {agrees}")
-        lines.append(f"| {methods[better].title} against {methods[worse].title} | " + " | ".join(cells) + " |")
-    return lines
+        table.append([f"{methods[better].title} against {methods[worse].title}", *cells])
+    return curves.markdown(table)
 
 
 # Pictures

@@ -1,6 +1,9 @@
 """C-HAC: who acts, when the second stage begins, and what learns in which stage."""
 
 import inspect
+import operator
+import re
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -14,6 +17,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.utils import set_random_seed
 
 from sb3_chac import CHAC, DPVP, DSAC
+from sb3_chac.common.buffers import DualReplayBufferSamples
 from sb3_chac.common.distributional import probability_of_improvement
 from sb3_chac.zoo.algorithms import hyperparams_file
 
@@ -60,6 +64,29 @@ def set_critic(model, q_value, std=lambda actions: 1.0):
 
 def predict(model, who, obs=OBS, deterministic=True):
     return model.predict(obs, deterministic=deterministic, control=who)[0]
+
+
+# --- The page of the paper's symbols
+
+
+def test_the_papers_symbols_are_where_the_page_says():
+    page = (Path(__file__).parents[1] / "docs" / "modules" / "chac.md").read_text(encoding="utf-8")
+    table = page.partition("| symbol | attribute |\n|---|---|\n")[2].partition("\n\n")[0]
+    model = silent(make_chac())
+    model.learn(1)
+    rows = [line.split("|") for line in table.splitlines()]
+    symbols = {symbol.strip().partition(",")[0] for _, symbol, _, _ in rows}
+    assert {"π_g", "π_r", "Z_g", "Z_c", "B_h", "I", "T_c", "N_g", "θ_c", "κ", "δ"} <= symbols
+    for _, symbol, cell, _ in rows:
+        names = re.findall(r"`([^`]+)`( of a batch)?", cell)
+        assert names, symbol
+        for name, of_a_batch in names:
+            if of_a_batch:
+                assert name in DualReplayBufferSamples._fields
+            elif key := re.fullmatch(r'info\["(\w+)"\]', name):
+                assert key[1] in model.get_env().step(np.zeros((1, 2)))[3][0]
+            else:
+                operator.attrgetter(name)(model)
 
 
 # --- Confidence and choice

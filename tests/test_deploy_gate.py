@@ -120,7 +120,7 @@ steps = st.lists(
 
 
 @given(steps)
-@settings(max_examples=300, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
+@settings(max_examples=300, derandomize=True, suppress_health_check=list(HealthCheck))
 def test_no_sequence_of_faults_leads_to_an_unchecked_action(sequence):
     gate, now, valid_at = Gate(LIMITS), 0.0, -math.inf
     last = gate.step(now, Given()).action

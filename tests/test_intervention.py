@@ -181,7 +181,7 @@ def test_the_budget_survives_a_restart():
     assert env.state is PAUSED
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(
     decisions=st.lists(st.booleans(), max_size=40),
     events=st.lists(st.sampled_from(["pause", "resume", "reset", "arm", "disarm", "step", "step", "step"]), max_size=60),

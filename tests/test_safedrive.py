@@ -397,7 +397,7 @@ def test_traffic_does_not_overlap_and_keeps_moving(density):
 # What the agent sees, over many seeds and actions
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(
     scenario=st.integers(-(10**9), 10**9),
     blocks=st.one_of(st.integers(1, 5), st.text(BLOCKS, min_size=1, max_size=4)),

@@ -14,12 +14,14 @@ from shell import FOREVER, wait_until
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 sys.path.insert(0, str(BENCHMARKS))
 
+import lab  # noqa: E402
 import suite  # noqa: E402
 import suite_job  # noqa: E402
 import suite_report  # noqa: E402
 from suite_job import Job, Outcome  # noqa: E402
 
 from sb3_chac.common.checkpoint_files import newest_checkpoint, sound_checkpoint  # noqa: E402
+from sb3_chac.evaluation import curves  # noqa: E402
 
 ROWS = {row.name: row for row in suite.ROWS}
 
@@ -32,15 +34,15 @@ def outcome(job: Job, success: bool = True) -> Outcome:
     facts = {"human_steps": 10, "total_steps": 100, "training_cost": 3.0, "fingerprint": suite_job.fingerprint(job)}
     record = {"method": job.row.name, "seed": job.seed, "return": 300.0 + job.seed, "cost": 0.5, "success": success}
     episodes = [record | {"scenario": number} | facts | {"versions": "x=1"} for number in suite_job.TEST_MAPS]
-    curves = [
+    points = [
         {"method": job.row.name, "seed": job.seed, "quantity": quantity, "step": step, "value": step / 10}
         for quantity in suite_job.CURVES
         for step in (10, 50, 100)
     ]
     drive = {"method": job.row.name, "seed": job.seed, "x": 1.0, "y": 2.0, "action_0": 0.1, "action_1": -0.2, "cost": 0}
     drives = [drive | {"scenario": number, "step": step} for number in suite_job.DRIVES for step in range(5)]
-    files = {"episodes": suite_job.table(episodes), "curves": suite_job.table(curves)}
-    return Outcome(files | ({"drives": suite_job.table(drives)} if job.keeps_drives else {}), b"model")
+    files = {"episodes": lab.to_csv(episodes), "curves": lab.to_csv(points)}
+    return Outcome(files | ({"drives": lab.to_csv(drives)} if job.keeps_drives else {}), b"model")
 
 
 # suite.py with fewer and shorter evaluations
@@ -129,7 +131,7 @@ def test_a_full_disk_leaves_the_job_unfinished(tmp_path, monkeypatch):
 
 
 def test_the_report_has_all_methods_and_names_what_contradicts_the_paper(tmp_path, monkeypatch):
-    monkeypatch.setattr(suite_report, "RESAMPLES", 50)
+    monkeypatch.setattr(curves, "RESAMPLES", 50)
     results = suite.Results(tmp_path)
     jobs = [a_job(name, seed) for name in ("pvp", "dpvp", "chac", "chac-no-share") for seed in (0, 1)]
     for job in jobs:
@@ -184,7 +186,8 @@ def test_a_killed_suite_goes_on_from_checkpoints_and_takes_its_processes_along(t
 
 @pytest.mark.parametrize("number", [pytest.param(signal.SIGTERM, marks=pytest.mark.slow), signal.SIGINT])
 def test_a_signal_ends_the_suite_and_its_jobs_in_good_order(tmp_path, number):
-    arguments = command(tmp_path, "run", "--rows", "pvp", "dpvp", "--seeds", "1", "--scale", "0.02", "--jobs", "1")
+    # Long enough not to end before the signal
+    arguments = command(tmp_path, "run", "--rows", "pvp", "dpvp", "--seeds", "1", "--scale", "1", "--jobs", "1")
     process = subprocess.Popen(arguments, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
     folder = tmp_path / "work" / "pvp-0"
     begun = folder / "logs" / "pvp" / "SafeDrive-v0_1" / "progress.csv"

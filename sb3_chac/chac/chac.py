@@ -389,11 +389,7 @@ class CHAC(DPVP):
         return rewards - self.cost_coef * costs.flatten()
 
     def _reward_scale(self) -> float:
-        """
-        Return the scale of the rewards.
-
-        :return: the unit of the rewards that Z_c learns
-        """
+        """Return the unit of the rewards that Z_c learns."""
         return max(self.reward_square**0.5, 1e-8) if self.normalize_rewards else 1.0
 
     @th.no_grad()
@@ -452,11 +448,7 @@ class CHAC(DPVP):
         )
 
     def _mean_log_prob(self) -> float:
-        """
-        Estimate the log-likelihood of the guided policy's own actions.
-
-        :return: mean of log pi_g over a batch
-        """
+        """Estimate the mean of log pi_g of its own actions, over a batch."""
         with th.no_grad():
             batch = self._sample_batch(self.batch_size)
             return self.actor.action_log_prob(batch.observations)[1].mean().item()

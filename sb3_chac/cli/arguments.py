@@ -1,11 +1,35 @@
 """Arguments of the command line that several commands share."""
 
+import argparse
 import ast
+import os
 import tempfile
 from pathlib import Path
 from typing import Any
 
+from sb3_chac.chac.policies import CONTROLS
 from sb3_chac.evaluation.episodes import NotEvaluable
+
+
+def add_env_kwargs(parser: argparse._ActionsContainer) -> None:
+    """Add ``--env-kwargs``, which ``parse_env_kwargs`` reads."""
+    parser.add_argument("--env-kwargs", nargs="+", default=[], metavar="KEY:VALUE", help="passed to it, Python literals")
+
+
+def add_seed_and_jobs(parser: argparse._ActionsContainer) -> None:
+    """Add ``--seed`` and ``--jobs``, of a command that drives episodes in several processes."""
+    parser.add_argument("--seed", type=int, default=0, help="the episodes' seeds derive from it (default: %(default)s)")
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    parser.add_argument(
+        "--jobs", type=int, default=cores, metavar="N", help="number of processes (default: %(default)s, the cores)"
+    )
+
+
+def add_control(parser: argparse._ActionsContainer) -> None:
+    """Add ``--control``, also by its old name ``--policy``."""
+    parser.add_argument(
+        "--control", "--policy", choices=CONTROLS, help="who acts of a C-HAC model in stage 2 (default: as in its training)"
+    )
 
 
 def check_output(option: str, path: Path | None, suffixes: tuple[str, ...] = ()) -> None:

@@ -11,6 +11,33 @@ from types import FrameType
 from typing import Any
 
 
+def command_parser(name: str, description: str) -> argparse.ArgumentParser:
+    """
+    Make the parser of a command.
+
+    :param name: of the command
+    :param description: shown by ``--help`` as it stands
+    :return: without arguments
+    """
+    return argparse.ArgumentParser(
+        f"sb3-chac {name}", description=description, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+
+
+def check_least(args: argparse.Namespace, error: type[Exception], **least: int) -> None:
+    """
+    Check options that have a lowest value.
+
+    :param args: parsed; an option that is None was left out
+    :param error: to raise
+    :param least: name of an option -> its lowest value
+    """
+    for name, low in least.items():
+        value = getattr(args, name)
+        if value is not None and value < low:
+            raise error(f"--{name.replace('_', '-')} must be at least {low}, got {value}.")
+
+
 def run_command(
     parser: argparse.ArgumentParser,
     arguments: list[str],

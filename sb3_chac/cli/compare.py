@@ -5,7 +5,7 @@ import re
 from pathlib import Path
 
 from sb3_chac.cli.arguments import check_output
-from sb3_chac.cli.command import run_command
+from sb3_chac.cli.command import command_parser, run_command
 from sb3_chac.cli.plot import NotPlottable, join
 from sb3_chac.evaluation import curves
 from sb3_chac.evaluation.curves import Method
@@ -34,9 +34,7 @@ QUANTITIES = (curves.RETURN, curves.SUCCESS, curves.TRAINING_COST, curves.HUMAN_
 
 def make_parser() -> argparse.ArgumentParser:
     """Make the parser of the command line."""
-    parser = argparse.ArgumentParser(
-        "sb3-chac compare", description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_parser("compare", DESCRIPTION)
     parser.add_argument("runs", nargs="+", metavar="RUN", help="[LABEL=]FOLDER[+FOLDER ...]")
     parser.add_argument(
         "--x",
@@ -124,7 +122,6 @@ def with_human(methods: list[Method]) -> list[Method]:
     """
     Select the methods that a human helped.
 
-    :return: the methods that a human helped
     :raises NotPlottable: if there is none
     """
     helped = [method for method in methods if any(curves.over_human_steps(run) for run in method.runs)]

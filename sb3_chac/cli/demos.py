@@ -12,8 +12,8 @@ from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_chac.cli.arguments import check_output, parse_env_kwargs
-from sb3_chac.cli.command import run_command
+from sb3_chac.cli.arguments import add_env_kwargs, add_seed_and_jobs, check_output, parse_env_kwargs
+from sb3_chac.cli.command import check_least, command_parser, run_command
 from sb3_chac.common.demonstrations import load_demonstrations
 from sb3_chac.common.minari_datasets import DatasetError, open_dataset
 from sb3_chac.datasets.recording import WatchedEnv, record
@@ -49,9 +49,7 @@ tells how far that led elsewhere than when it was recorded. The environment must
 
 def make_parser() -> argparse.ArgumentParser:
     """Make the parser of the command line."""
-    parser = argparse.ArgumentParser(
-        "sb3-chac demos", description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_parser("demos", DESCRIPTION)
     commands = parser.add_subparsers(dest="command", required=True, metavar="{record,info,replay,from-log}")
     new = commands.add_parser("record", help="record a dataset", description=RECORD)
     new.add_argument("--dataset", required=True, metavar="ID", help="such as safedrive/scripted-v0, or a folder such as ./ds")
@@ -72,15 +70,11 @@ def make_parser() -> argparse.ArgumentParser:
     )
     where = new.add_argument_group("where")
     where.add_argument("--env", default=DEFAULT_ENV, metavar="ID", help="environment, also module:ID (default: %(default)s)")
-    where.add_argument("--env-kwargs", nargs="+", default=[], metavar="KEY:VALUE", help="passed to it, Python literals")
+    add_env_kwargs(where)
     where.add_argument(
         "--scenarios", metavar="RANGE", help="in turns, e.g. 100:120 (without 120) (default: the environment chooses)"
     )
-    where.add_argument("--seed", type=int, default=0, help="the episodes' seeds derive from it (default: %(default)s)")
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    where.add_argument(
-        "--jobs", type=int, default=cores, metavar="N", help="number of processes (default: %(default)s, the cores)"
-    )
+    add_seed_and_jobs(where)
 
     info = commands.add_parser("info", help="what is in a dataset", description="Print what is in a dataset.")
     replay = commands.add_parser("replay", help="drive an episode again", description=REPLAY)
@@ -91,7 +85,7 @@ def make_parser() -> argparse.ArgumentParser:
     from_log.add_argument("--dataset", required=True, metavar="ID", help="such as drives/monday-v0, or a folder such as ./ds")
     from_log.add_argument("--overwrite", action="store_true", help="replace a dataset of that name")
     from_log.add_argument("--env", default=DEFAULT_ENV, metavar="ID", help="with the vehicle's spaces (default: %(default)s)")
-    from_log.add_argument("--env-kwargs", nargs="+", default=[], metavar="KEY:VALUE", help="passed to it, Python literals")
+    add_env_kwargs(from_log)
     replay.add_argument("--episode", type=int, default=0, metavar="K", help="number, from 0 (default: %(default)s)")
     replay.add_argument("--video", type=Path, metavar="FILE", help=".mp4 or .gif of it")
     for command in (new, info, replay, from_log):
@@ -143,9 +137,7 @@ def run_record(args: argparse.Namespace) -> None:
     :raises FileNotFoundError: if a model does not exist
     :raises NotEvaluable: for whatever else does not fit
     """
-    for option, low in [("steps", 1), ("seed", 0), ("jobs", 1)]:
-        if getattr(args, option) < low:
-            raise NotEvaluable(f"--{option} must be at least {low}, got {getattr(args, option)}.")
+    check_least(args, NotEvaluable, steps=1, seed=0, jobs=1)
     if args.rule is not None and args.novice is None:
         raise NotEvaluable(f"--rule {args.rule}: it says when the expert takes over from a novice, give --novice, too.")
     env_kwargs = parse_env_kwargs(args.env_kwargs)
@@ -179,11 +171,7 @@ def run_record(args: argparse.Namespace) -> None:
 
 
 def find_model(path: Path, env_id: str, env_kwargs: dict[str, Any]) -> tuple[BaseAlgorithm, VecNormalize | None]:
-    """
-    Load a model with the statistics of its observations.
-
-    :return: the model, and the statistics that its observations are normalized with, if any
-    """
+    """Load a model, and the statistics that its observations are normalized with, if any."""
     path, algo, algorithm = find_algorithm(path, None)
     env = make_env(env_id, env_kwargs)
     model = load_model(path, algo, algorithm, env)

@@ -12,8 +12,8 @@ from typing import Any
 
 import torch as th
 
-from sb3_chac.cli.arguments import parse_env_kwargs
-from sb3_chac.cli.command import run_command
+from sb3_chac.cli.arguments import add_env_kwargs, parse_env_kwargs
+from sb3_chac.cli.command import check_least, command_parser, run_command
 from sb3_chac.cockpit.devices import (
     GAMEPAD,
     WHEEL,
@@ -46,13 +46,11 @@ SAVE_FREQ = 600  # steps: a minute
 
 def make_parser() -> argparse.ArgumentParser:
     """Make the parser of the command line."""
-    parser = argparse.ArgumentParser(
-        "sb3-chac drive", description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_parser("drive", DESCRIPTION)
     what = parser.add_argument_group("what is trained")
     what.add_argument("--algo", default="chac", help="chac, dpvp, pvp, hg_dagger or iwr (default: %(default)s)")
     what.add_argument("--env", default=DEFAULT_ENV, metavar="ID", help="environment (default: %(default)s)")
-    what.add_argument("--env-kwargs", nargs="+", default=[], metavar="KEY:VALUE", help="passed to it, Python literals")
+    add_env_kwargs(what)
     what.add_argument("-params", "--hyperparams", nargs="+", default=[], metavar="KEY:VALUE", help="other hyperparameters")
     what.add_argument("--conf-file", metavar="FILE", help="other hyperparameters file")
     what.add_argument("-n", "--n-timesteps", type=int, default=-1, metavar="N", help="steps in all (default: the yaml's)")
@@ -221,9 +219,7 @@ def check_arguments(args: argparse.Namespace) -> None:
         raise NotDrivable(f"--algo {args.algo} does not learn from takeovers, choose from {known}.")
     if args.env not in gym.registry:
         raise NotDrivable(f"--env: gymnasium knows no {args.env!r}.")
-    for option, low in (("pretrain", 0), ("save_freq", 0)):
-        if getattr(args, option) < low:
-            raise NotDrivable(f"--{option.replace('_', '-')} must be at least {low}, got {getattr(args, option)}.")
+    check_least(args, NotDrivable, pretrain=0, save_freq=0)
     if args.trained_agent and not Path(args.trained_agent).is_file():
         raise NotDrivable(f"--trained-agent: there is no file {args.trained_agent}.")
     if args.pretrain and not args.demos:

@@ -2,7 +2,6 @@
 
 import argparse
 import csv
-import os
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -11,8 +10,8 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_chac.chac.policies import CONTROLS
-from sb3_chac.cli.arguments import check_output, parse_env_kwargs
-from sb3_chac.cli.command import run_command
+from sb3_chac.cli.arguments import add_control, add_env_kwargs, add_seed_and_jobs, check_output, parse_env_kwargs
+from sb3_chac.cli.command import check_least, command_parser, run_command
 from sb3_chac.evaluation import pictures
 from sb3_chac.evaluation.episodes import NotEvaluable, Runner, Task, make_env
 from sb3_chac.evaluation.evaluation import Evaluation, compare, evaluate, scenario_list
@@ -35,16 +34,12 @@ A model and its vecnormalize.pkl are code (docs/loading.md): load those that you
 
 def make_parser() -> argparse.ArgumentParser:
     """Make the parser of the command line."""
-    parser = argparse.ArgumentParser(
-        "sb3-chac evaluate", description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_parser("evaluate", DESCRIPTION)
     who = parser.add_argument_group("who acts (one of the two)")
     who.add_argument("model", nargs="?", type=Path, metavar="MODEL.zip", help="a model saved by Stable-Baselines3")
     who.add_argument("--expert", metavar="NAME", help="an expert of the environment, as scripted, or package.module:function")
     who.add_argument("--algo", metavar="NAME", help="algorithm of the model as RL-Zoo3 calls it (default: read from the file)")
-    who.add_argument(
-        "--control", "--policy", choices=CONTROLS, help="who acts of a C-HAC model in stage 2 (default: as in its training)"
-    )
+    add_control(who)
     who.add_argument(
         "--beside",
         nargs="+",
@@ -59,7 +54,7 @@ def make_parser() -> argparse.ArgumentParser:
         metavar="ID",
         help=f"environment, also module:ID (default: ours that MODEL.zip is called after, else {DEFAULT_ENV})",
     )
-    where.add_argument("--env-kwargs", nargs="+", default=[], metavar="KEY:VALUE", help="passed to it, Python literals")
+    add_env_kwargs(where)
     count = where.add_mutually_exclusive_group()
     count.add_argument(
         "--scenarios",
@@ -68,11 +63,7 @@ def make_parser() -> argparse.ArgumentParser:
         help="1000:1050 (without 1050), 1000 or 1000,1003:1010 (%(default)s)",
     )
     count.add_argument("--episodes", type=int, metavar="N", help="for environments without scenarios: number of episodes")
-    where.add_argument("--seed", type=int, default=0, help="the episodes' seeds derive from it (default: %(default)s)")
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    where.add_argument(
-        "--jobs", type=int, default=cores, metavar="N", help="number of processes (default: %(default)s, the cores)"
-    )
+    add_seed_and_jobs(where)
     what = parser.add_argument_group("what is written, besides the table")
     what.add_argument("--json", type=Path, metavar="FILE", help="summary, settings, versions and one record per episode")
     what.add_argument("--steps", type=Path, metavar="FILE.csv", help="a row per step: position, action, whether cost arose")
@@ -144,10 +135,7 @@ def resolve(args: argparse.Namespace) -> Request:
     check_output("--steps", args.steps, (".csv",))
     check_output("--plot", args.plot, pictures.PLOT_SUFFIXES)
     check_output("--video", args.video, pictures.VIDEO_SUFFIXES)
-    for option, low in [("seed", 0), ("jobs", 1), ("episodes", 1)]:
-        value = getattr(args, option)
-        if value is not None and value < low:
-            raise NotEvaluable(f"--{option} must be at least {low}, got {value}.")
+    check_least(args, NotEvaluable, seed=0, jobs=1, episodes=1)
     numbers = scenario_list(args.scenarios) if args.episodes is None else list(range(args.episodes))
     filmed = numbers[0] if args.video_scenario is None else args.video_scenario
     if filmed not in numbers:

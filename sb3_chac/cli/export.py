@@ -8,9 +8,8 @@ from pathlib import Path
 
 import torch as th
 
-from sb3_chac.chac.policies import CONTROLS
-from sb3_chac.cli.arguments import check_output, parse_env_kwargs
-from sb3_chac.cli.command import run_command
+from sb3_chac.cli.arguments import add_control, add_env_kwargs, check_output, parse_env_kwargs
+from sb3_chac.cli.command import check_least, command_parser, run_command
 from sb3_chac.deploy.export import compare, export
 from sb3_chac.deploy.metadata import NotDeployable
 from sb3_chac.deploy.policy import OnnxPolicy
@@ -31,20 +30,16 @@ A model and its vecnormalize.pkl are code (docs/loading.md): load those that you
 
 
 def make_parser() -> argparse.ArgumentParser:
-    """Return the parser of the command line."""
-    parser = argparse.ArgumentParser(
-        "sb3-chac export", description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    """Make the parser of the command line."""
+    parser = command_parser("export", DESCRIPTION)
     parser.add_argument("model", type=Path, metavar="MODEL.zip", help="a model saved by Stable-Baselines3")
     parser.add_argument("file", type=Path, metavar="POLICY.onnx", help="the file to write")
     parser.add_argument(
         "--env", metavar="ID", help="environment, also module:ID (default: ours that MODEL.zip is called after)"
     )
-    parser.add_argument("--env-kwargs", nargs="+", default=[], metavar="KEY:VALUE", help="passed to it, Python literals")
+    add_env_kwargs(parser)
     parser.add_argument("--algo", metavar="NAME", help="algorithm as RL-Zoo3 calls it (default: read from the file)")
-    parser.add_argument(
-        "--control", "--policy", choices=CONTROLS, help="who acts of a C-HAC model in stage 2 (default: as in its training)"
-    )
+    add_control(parser)
     parser.add_argument("--rate", type=float, metavar="HZ", help="decisions per second (default: the environment's)")
     parser.add_argument("--check", type=int, metavar="N", help="drive N steps and compare with predict(); differences fail")
     parser.add_argument(
@@ -74,8 +69,7 @@ def run(args: argparse.Namespace) -> bool:
     :raises ValueError: for whatever else does not fit (``NotEvaluable``, ``NotDeployable``)
     """
     th.set_num_threads(1)
-    if args.check is not None and args.check < 1:
-        raise NotDeployable(f"--check must be at least 1, got {args.check}.")
+    check_least(args, NotDeployable, check=1)
     if args.rate is not None and not (math.isfinite(args.rate) and args.rate > 0):
         raise NotDeployable(f"--rate must be a finite number above 0, got {args.rate}.")
     check_output("POLICY.onnx", args.file, (".onnx",))

@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from sb3_chac.cli.arguments import check_output
-from sb3_chac.cli.command import run_command
+from sb3_chac.cli.command import command_parser, run_command
 from sb3_chac.common.callbacks import PROGRESS_FILE
 from sb3_chac.common.checks import real_numbers
 from sb3_chac.evaluation.episodes import NotEvaluable
@@ -63,9 +63,7 @@ Curves = dict[str, np.ndarray]
 
 def make_parser() -> argparse.ArgumentParser:
     """Make the parser of the command line."""
-    parser = argparse.ArgumentParser(
-        "sb3-chac plot", description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_parser("plot", DESCRIPTION)
     parser.add_argument(
         "run_folders", nargs="+", type=Path, metavar="RUN_FOLDER", help="a run, and in order those that resumed it"
     )

@@ -7,7 +7,7 @@ from functools import partial
 from importlib import import_module
 from pathlib import Path
 
-from sb3_chac.cli.command import run_command
+from sb3_chac.cli.command import command_parser, run_command
 from sb3_chac.zoo import register
 from sb3_chac.zoo.runs import NotResumable, find_training, steps
 from sb3_chac.zoo.stopping import one_sentence
@@ -29,9 +29,7 @@ A run folder is code: models, replay buffers and command lines in it can run any
 
 def make_parser() -> argparse.ArgumentParser:
     """Make the parser of the command line."""
-    parser = argparse.ArgumentParser(
-        "sb3-chac resume", description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_parser("resume", DESCRIPTION)
     parser.add_argument("run_folder", type=Path, metavar="RUN_FOLDER", help="e.g. logs/chac/SafeDrive-v0_1")
     return parser
 

@@ -8,7 +8,7 @@ import time
 from contextlib import ExitStack
 from pathlib import Path
 
-from sb3_chac.cli.command import run_command
+from sb3_chac.cli.command import check_least, command_parser, run_command
 from sb3_chac.deploy.address import bound_socket, parse_address, resolve
 from sb3_chac.deploy.gate import Limits
 from sb3_chac.deploy.log import DecisionLog
@@ -29,10 +29,8 @@ Packets are neither encrypted nor authenticated: use a network that nobody else 
 
 
 def make_parser() -> argparse.ArgumentParser:
-    """Return the parser of the command line."""
-    parser = argparse.ArgumentParser(
-        "sb3-chac run", description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    """Make the parser of the command line."""
+    parser = command_parser("run", DESCRIPTION)
     parser.add_argument("policy", type=Path, metavar="POLICY.onnx", help="a file that 'sb3-chac export' wrote")
     link = parser.add_argument_group("link")
     link.add_argument("--listen", default="127.0.0.1:5600", metavar="HOST:PORT", help="(default: %(default)s)")
@@ -76,10 +74,7 @@ def run(args: argparse.Namespace) -> None:
     start = time.perf_counter()
     address = parse_address("--listen", args.listen)
     allowed = None if args.vehicle is None else resolve("--vehicle", args.vehicle)
-    for option, low in [("copies", 1), ("steps", 1)]:
-        value = getattr(args, option)
-        if value is not None and value < low:
-            raise NotDeployable(f"--{option} must be at least {low}, got {value}.")
+    check_least(args, NotDeployable, copies=1, steps=1)
     policy = OnnxPolicy(args.policy)
     times = {name: getattr(args, name) for name in ("max_age", "max_silence", "deadline", "hold_for")}
     brake = None if args.brake is None else parse_brake(args.brake)

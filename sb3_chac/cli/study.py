@@ -10,7 +10,7 @@ import numpy as np
 import torch as th
 
 from sb3_chac.cli import drive as drive_command
-from sb3_chac.cli.command import run_command
+from sb3_chac.cli.command import check_least, command_parser, run_command
 from sb3_chac.cockpit.address import parse_address
 from sb3_chac.cockpit.person import NotDrivable, Person
 from sb3_chac.cockpit.session import Session, SessionEnded
@@ -26,9 +26,7 @@ sb3_chac/cockpit/README.md, an example is examples/study. Models are code (docs/
 
 def make_parser() -> argparse.ArgumentParser:
     """Make the parser of the command line."""
-    parser = argparse.ArgumentParser(
-        "sb3-chac study", description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_parser("study", DESCRIPTION)
     parser.add_argument("path", type=Path, metavar="PROTOCOL", help="YAML; with --summary the folder of the study")
     parser.add_argument("--summary", action="store_true", help="sum up all participants")
     parser.add_argument("--out", type=Path, metavar="FOLDER", help="of the study")
@@ -64,8 +62,7 @@ def run(args: argparse.Namespace) -> None:
         return
     if args.out is None:
         raise StudyError("--out FOLDER is missing: what participants do is stored there.")
-    if args.participant is not None and args.participant < 1:
-        raise StudyError(f"--participant must be at least 1, got {args.participant}.")
+    check_least(args, StudyError, participant=1)
     if args.tls_key and not args.tls_cert:
         raise StudyError("--tls-key needs its certificate: --tls-cert.")
     th.set_num_threads(1)
@@ -105,7 +102,7 @@ def check_drives(protocol: Any, folder: Path) -> None:
 
 class Study:
     """
-    What one participant goes through.
+    Parts of a study that one participant goes through.
 
     :param protocol: of the study
     :param participant: whose folder is in use
@@ -121,7 +118,7 @@ class Study:
 
     @property
     def has_driven(self) -> bool:
-        """Whether there is an episode of a condition."""
+        """Tell whether there is an episode of a condition."""
         return any(self.participant.episodes(name) for name in self.protocol.conditions)
 
     def serve(self, args: argparse.Namespace) -> None:

@@ -7,8 +7,8 @@ from pathlib import Path
 import gymnasium as gym
 
 import sb3_chac.envs  # noqa: F401  (registers our environments)
-from sb3_chac.cli.arguments import check_output, parse_env_kwargs
-from sb3_chac.cli.command import run_command
+from sb3_chac.cli.arguments import add_env_kwargs, check_output, parse_env_kwargs
+from sb3_chac.cli.command import check_least, command_parser, run_command
 from sb3_chac.common.files import write_safely
 from sb3_chac.deploy.address import bound_socket, parse_address
 from sb3_chac.deploy.metadata import NotDeployable
@@ -28,12 +28,10 @@ else is on."""
 
 def make_parser() -> argparse.ArgumentParser:
     """Make the parser of the command line."""
-    parser = argparse.ArgumentParser(
-        "sb3-chac vehicle", description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_parser("vehicle", DESCRIPTION)
     what = parser.add_argument_group("vehicle")
     what.add_argument("--env", default="RoadTest-v0", metavar="ID", help="environment, also module:ID (default: %(default)s)")
-    what.add_argument("--env-kwargs", nargs="+", default=[], metavar="KEY:VALUE", help="passed to it, Python literals")
+    add_env_kwargs(what)
     what.add_argument("--expert", default="scripted", metavar="NAME", help="who takes over, also package.module:function")
     what.add_argument("--rule", default="risk", metavar="NAME", help="when: risk, disagreement, always or never (%(default)s)")
     what.add_argument("--budget", type=int, metavar="N", help="steps of the person at most (default: no limit)")
@@ -68,10 +66,7 @@ def run(args: argparse.Namespace) -> None:
     """
     address = parse_address("--listen", args.listen)
     check_output("--ready", args.ready)
-    for option, low in (("steps", 1), ("seed", 0), ("budget", 1)):
-        value = getattr(args, option)
-        if value is not None and value < low:
-            raise NotDeployable(f"--{option} must be at least {low}, got {value}.")
+    check_least(args, NotDeployable, steps=1, seed=0, budget=1)
     env: gym.Env = make_env(args.env, parse_env_kwargs(args.env_kwargs))
     try:
         env.reset()  # compiles and loads, which takes longer than a learner waits for an answer

@@ -1,12 +1,11 @@
 """Forms that the page asks to fill in: consent, the scales of NASA-TLX, free text."""
 
-import json
 from collections.abc import Iterable
 from dataclasses import dataclass
 from statistics import fmean
 from typing import Any, NamedTuple
 
-from sb3_chac.cockpit.devices.browser import BadMessage
+from sb3_chac.cockpit.devices.browser import BadMessage, read_json
 
 STEP, MOST = 5, 100  # of a scale
 AGREE, DECLINE = "I agree", "I do not agree"
@@ -58,11 +57,7 @@ class Form:
         :param number: of this form: an answer to another one is refused
         :raises BadMessage: for everything else
         """
-        try:
-            data = json.loads(text)
-        except (ValueError, RecursionError) as error:
-            raise BadMessage("no JSON") from error
-        match data:
+        match data := read_json(text):
             case {"form": int(form), "choice": str(choice), "values": dict(values)} if len(data) == 3:
                 if form != number:
                     raise BadMessage("that form is not asked any more")

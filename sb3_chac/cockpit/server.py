@@ -289,11 +289,7 @@ class Server:
                     await viewer.socket.send_bytes(picture)
 
     def state(self, viewer: Viewer) -> dict[str, Any]:
-        """
-        Collect what the page shows besides the picture.
-
-        :return: what the page shows besides the picture
-        """
+        """Collect what the page shows besides the picture."""
         drive, display, now = self.drive, self.drive.display, self.drive.person.read()
         driver = who_drives(display, now.connected)
         if viewer is self.driver:

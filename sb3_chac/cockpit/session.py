@@ -197,11 +197,7 @@ class Session:
             self._changed.notify_all()
 
     def take_skip(self) -> bool:
-        """
-        Tell once whether the episode is to end.
-
-        :return: whether the episode is to end
-        """
+        """Tell once whether the episode is to end."""
         with self._changed:
             skip, self._skip = self._skip, False
         return skip
@@ -225,11 +221,7 @@ class Session:
     # For those who work beside it
 
     def time_to_tick(self) -> float:
-        """
-        Return the time that is left before the next step.
-
-        :return: [s] until the next step, infinite in a pause
-        """
+        """Return the time [s] that is left before the next step, infinite in a pause."""
         return float("inf") if self.paused else self._next_tick - time.monotonic()
 
     def wait_for_room(self, seconds: float) -> None:

@@ -108,7 +108,6 @@ class Cockpit(gym.Wrapper):
         Tell whether a collision has begun. Environments report one by ``collision``, or by ``crashed`` while it lasts.
 
         :param info: of a step
-        :return: whether one has begun in it
         """
         before, self._touched = self._touched, bool(happened_in(info, "crashed"))
         collision = happened_in(info, "collision")

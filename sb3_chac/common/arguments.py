@@ -86,11 +86,7 @@ def checked(method: Method) -> Method:
 
 
 def annotations(method: Callable[..., Any]) -> dict[str, Any]:
-    """
-    Collect the annotations of the arguments of a method.
-
-    :return: those of the arguments, by name
-    """
+    """Collect the annotations of the arguments of a method, by name."""
     # SB3's GymEnv names the first, a Dataset of demonstrations the others, which say themselves what is wrong with one
     return typing.get_type_hints(method, localns={"VecEnv": VecEnv, "Demonstrations": Any, "MinariDataset": Any})
 
@@ -228,8 +224,7 @@ def ends_of_schedule(name: str, schedule: Callable[[float], Any]) -> tuple[float
 
     :param name: of the argument
     :param schedule: of the remaining progress
-    :return: its values at the start and at the end
-    :raises ValueError: if it fails, or they are no numbers
+    :raises ValueError: if it fails, or its values are no numbers
     """
     try:
         return float(schedule(1.0)), float(schedule(0.0))

@@ -42,11 +42,32 @@ def take_rows(observations: th.Tensor | TensorDict, rows: th.Tensor) -> Any:
 
     :param observations: batch of observations, possibly a dictionary
     :param rows: indices
-    :return: the observations of these rows
     """
     if isinstance(observations, dict):
         return {key: value[rows] for key, value in observations.items()}
     return observations[rows]
+
+
+class TakenOver(NamedTuple):
+    """Rows of a batch that the human drove, n of them."""
+
+    rows: th.Tensor  # (n,)
+    observations: th.Tensor | TensorDict
+    novice_actions: th.Tensor  # (n, action_dim)
+    differ: th.Tensor  # (n,) whether the human's action is far enough from the novice's to be told from it
+
+
+def taken_over(batch: DualReplayBufferSamples, min_diff: float) -> TakenOver:
+    """
+    Find what the human drove in a batch.
+
+    :param batch: of transitions
+    :param min_diff: least root mean square of the difference between two actions that are told apart
+    """
+    rows = batch.takeovers.flatten().nonzero().flatten()
+    novice_actions = batch.novice_actions[rows]
+    differ = (batch.actions[rows] - novice_actions).square().mean(dim=1).sqrt() >= min_diff
+    return TakenOver(rows, take_rows(batch.observations, rows), novice_actions, differ)
 
 
 class TransitionStore:
@@ -196,11 +217,7 @@ class DualReplayBuffer(ReplayBuffer):
             row |= {name: np.zeros(1, np.float32) for name in SCALARS if name not in row}
 
     def size(self) -> int:
-        """
-        Count the transitions of both stores.
-
-        :return: number of transitions in both stores
-        """
+        """Count the transitions of both stores."""
         return len(self.novice) + len(self.human)
 
     def reset(self) -> None:

@@ -1,11 +1,19 @@
 """Refuses numbers of the environments that are not finite, before anything is made of them."""
 
+from typing import TypeVar
+
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
+from sb3_chac.common.arguments import checked
 from sb3_chac.common.checks import check_finite, check_step
+from sb3_chac.common.own_arrays import keep_last_observations
+
+SelfCheckedLearning = TypeVar("SelfCheckedLearning", bound="CheckedLearning")
 
 
 class CheckedVecEnv(VecEnvWrapper):
@@ -57,3 +65,50 @@ def check_what_is_normalized(env: VecEnv, model: BaseAlgorithm) -> None:
             below = env.venv.venv if isinstance(env.venv, CheckedVecEnv) else env.venv
             env.venv = CheckedVecEnv(below, model)
         env = env.venv
+
+
+def check_critics_were_kept(model: BaseAlgorithm) -> None:
+    """
+    Check that a model can go on learning, one that was published.
+
+    :raises ValueError: if its critics are zeros, as in the agents of benchmarks/agents, which are published without them
+    """
+    critic = getattr(model.policy, "critic", None)
+    if critic is not None and not any(parameter.any() for parameter in critic.parameters()):
+        raise ValueError(
+            f"policy: the critics of this {type(model).__name__} are all zeros: it was published to act, without what only "
+            "learns, and cannot go on learning. Evaluate it, or train a new one."
+        )
+
+
+class CheckedLearning(BaseAlgorithm):
+    """Base of algorithms that refuse, when learning begins, what they cannot learn from."""
+
+    @checked
+    def learn(
+        self: SelfCheckedLearning,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int | None = 4,
+        tb_log_name: str = "run",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> SelfCheckedLearning:
+        check_env_is_there(self)
+        return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)  # type: ignore[arg-type, safe-super]
+
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        reset_num_timesteps: bool = True,
+        tb_log_name: str = "run",
+        progress_bar: bool = False,
+    ) -> tuple[int, BaseCallback]:
+        assert self.env is not None
+        check_critics_were_kept(self)
+        keep_last_observations(self.env)
+        check_what_is_normalized(self.env, self)
+        prepared = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
+        check_finite("observation", self._last_obs, self.num_timesteps)  # type: ignore[arg-type]
+        return prepared

@@ -1,56 +1,22 @@
 """Refuses steps of the environments that are not finite, for the algorithms that learn from rollouts."""
 
 import copy
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
-from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_chac.common.arguments import checked
-from sb3_chac.common.checked_env import CheckedVecEnv, check_env_is_there, check_what_is_normalized
-from sb3_chac.common.checks import check_finite
-from sb3_chac.common.own_arrays import keep_last_observations
+from sb3_chac.common.checked_env import CheckedLearning, CheckedVecEnv
 from sb3_chac.common.own_steps import NoticesOthers
 from sb3_chac.common.saved_by import NamedAlgorithm
 from sb3_chac.common.utils import detach_distributions
 
-SelfChecked = TypeVar("SelfChecked", bound="CheckedRollouts")
 
-
-class CheckedRollouts(NamedAlgorithm, NoticesOthers, OnPolicyAlgorithm):
+class CheckedRollouts(CheckedLearning, NamedAlgorithm, NoticesOthers, OnPolicyAlgorithm):
     """Base of on-policy algorithms that refuse what is not finite before it is stored, as ``CheckedOffPolicyAlgorithm``."""
-
-    @checked
-    def learn(
-        self: SelfChecked,
-        total_timesteps: int,
-        callback: MaybeCallback = None,
-        log_interval: int | None = 1,
-        tb_log_name: str = "run",
-        reset_num_timesteps: bool = True,
-        progress_bar: bool = False,
-    ) -> SelfChecked:
-        check_env_is_there(self)
-        return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)  # type: ignore[arg-type]
-
-    def _setup_learn(
-        self,
-        total_timesteps: int,
-        callback: MaybeCallback = None,
-        reset_num_timesteps: bool = True,
-        tb_log_name: str = "run",
-        progress_bar: bool = False,
-    ) -> tuple[int, BaseCallback]:
-        assert self.env is not None
-        keep_last_observations(self.env)
-        check_what_is_normalized(self.env, self)
-        prepared = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
-        check_finite("observation", self._last_obs, self.num_timesteps)  # type: ignore[arg-type]
-        return prepared
 
     def _update_info_buffer(self, infos: list[dict[str, Any]], dones: np.ndarray | None = None) -> None:
         super()._update_info_buffer(infos, dones)

@@ -161,19 +161,11 @@ class TakeoverWrapper(gym.Wrapper):
     budget: int | None
 
     def takeover_budget(self) -> int | None:
-        """
-        Return the human's budget.
-
-        :return: how many steps the human drives at most
-        """
+        """Return the number of steps that the human drives at most."""
         return self.budget
 
     def takeover_space(self) -> spaces.Space:
-        """
-        Return the space of the actions that are replaced in a takeover.
-
-        :return: the space of the actions that are replaced in a takeover
-        """
+        """Return the space of the actions that are replaced in a takeover."""
         return self.action_space
 
 

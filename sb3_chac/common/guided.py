@@ -322,11 +322,7 @@ class GuidedOffPolicyAlgorithm(CheckedOffPolicyAlgorithm):
             self._note_wrapper_states({idx: {name: infos[idx][name] for name in WRAPPER_COUNTS} for idx in self._wrapped})
 
     def _happens(self, idx: int, key: str, value: bool, done: bool) -> bool:
-        """
-        Tell whether an event begins.
-
-        :return: whether an event begins that ``info[key]`` tells of
-        """
+        """Tell whether an event begins that ``info[key]`` tells of."""
         if key not in LASTING:
             return value
         before = self._events_last[idx, LASTING.index(key)]

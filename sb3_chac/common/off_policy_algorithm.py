@@ -2,22 +2,21 @@
 
 import io
 import pathlib
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.save_util import load_from_zip_file
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, TensorDict
+from stable_baselines3.common.type_aliases import GymEnv, TensorDict
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_chac.common.arguments import check_policy_kwargs, checked
-from sb3_chac.common.checked_env import check_env_is_there, check_what_is_normalized
+from sb3_chac.common.arguments import check_policy_kwargs
+from sb3_chac.common.checked_env import CheckedLearning
 from sb3_chac.common.checks import (
     MismatchedParameters,
     check_action_space,
@@ -28,14 +27,11 @@ from sb3_chac.common.checks import (
     check_range,
     check_step,
 )
-from sb3_chac.common.own_arrays import keep_last_observations
 from sb3_chac.common.own_steps import NoticesOthers
 from sb3_chac.common.saved_by import NamedAlgorithm
 
-SelfChecked = TypeVar("SelfChecked", bound="CheckedOffPolicyAlgorithm")
 
-
-class CheckedOffPolicyAlgorithm(NamedAlgorithm, NoticesOthers, OffPolicyAlgorithm):
+class CheckedOffPolicyAlgorithm(CheckedLearning, NamedAlgorithm, NoticesOthers, OffPolicyAlgorithm):
     """
     SB3's OffPolicyAlgorithm for continuous actions, which refuses bad arguments, checkpoints of other algorithms and
     observations or rewards that are not finite, each with one message, before anything is changed or stored.
@@ -73,48 +69,6 @@ class CheckedOffPolicyAlgorithm(NamedAlgorithm, NoticesOthers, OffPolicyAlgorith
     def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
         check_action_space(env.action_space)
         return BaseAlgorithm._wrap_env(env, verbose, monitor_wrapper)
-
-    @checked
-    def learn(
-        self: SelfChecked,
-        total_timesteps: int,
-        callback: MaybeCallback = None,
-        log_interval: int | None = 4,
-        tb_log_name: str = "run",
-        reset_num_timesteps: bool = True,
-        progress_bar: bool = False,
-    ) -> SelfChecked:
-        check_env_is_there(self)
-        return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)  # type: ignore[arg-type]
-
-    def _setup_learn(
-        self,
-        total_timesteps: int,
-        callback: MaybeCallback = None,
-        reset_num_timesteps: bool = True,
-        tb_log_name: str = "run",
-        progress_bar: bool = False,
-    ) -> tuple[int, BaseCallback]:
-        assert self.env is not None
-        self._check_critics()
-        keep_last_observations(self.env)
-        check_what_is_normalized(self.env, self)
-        prepared = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
-        check_finite("observation", self._last_obs, self.num_timesteps)  # type: ignore[arg-type]
-        return prepared
-
-    def _check_critics(self) -> None:
-        """
-        Check that a model can go on learning.
-
-        :raises ValueError: if the critics are zeros, as in the agents of benchmarks/agents, which are published without them
-        """
-        critic = getattr(self.policy, "critic", None)
-        if critic is not None and not any(parameter.any() for parameter in critic.parameters()):
-            raise ValueError(
-                f"policy: the critics of this {type(self).__name__} are all zeros: it was published to act, without what only "
-                "learns, and cannot go on learning. Evaluate it, or train a new one."
-            )
 
     def _forget_episodes(self) -> None:
         super()._forget_episodes()

@@ -77,7 +77,7 @@ class DatasetSampler:
         """
         Draw a batch of steps.
 
-        :return: indices of steps, shape (batch_size,); a pass ends where the next batch would not be full
+        :return: their indices, shape (batch_size,); a pass ends where the next batch would not be full
         """
         if self.position + self.batch_size > len(self.order):
             self.order, self.position = self.rng.permutation(self.training), 0
@@ -258,7 +258,7 @@ class OfflineAlgorithm(NamedAlgorithm):
         self._update_learning_rate(self._optimizers())
 
     def _optimizers(self) -> list[th.optim.Optimizer]:
-        """Those that follow ``learning_rate``."""
+        """Return the optimizers that follow ``learning_rate``."""
         raise NotImplementedError
 
     def _gradient_step(self, batch: Batch) -> dict[str, th.Tensor]:

@@ -14,7 +14,7 @@ class _Info(dict[str, Any]):
 
 
 class _Infos(list[Any]):
-    """Of all environments, one ``_Info`` each."""
+    """Infos of all environments, one ``_Info`` each."""
 
     def __setitem__(self, idx: Any, info: Any) -> None:
         super().__setitem__(idx, _Info(info))

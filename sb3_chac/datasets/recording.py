@@ -232,11 +232,7 @@ class Recorder(Runner):
         return {key: np.array([zero, *(step.get(key, zero) for step in steps)]) for key, zero in zeros.items()}
 
     def _in_space(self, action: Any) -> Any:
-        """
-        Copy an action in the dtype of its space.
-
-        :return: a copy, in the dtype of the action space: what is executed is what is stored
-        """
+        """Copy an action in the dtype of its space: what is executed is what is stored."""
         space = self.env.action_space
         return int(action) if isinstance(space, spaces.Discrete) else np.array(action, space.dtype)
 

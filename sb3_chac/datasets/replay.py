@@ -69,11 +69,7 @@ class Replay(Runner):
         return {"episode": number, "return": math.fsum(self.rewards), "steps": len(self.rewards)}, None
 
     def report(self) -> str:
-        """
-        Word how the replay differs from the recording.
-
-        :return: how what happened differs from what was recorded, to read
-        """
+        """Tell in words how the replay differs from the recording."""
         steps, recorded_steps = len(self.rewards), len(self.recorded.rewards)
         total, recorded_total = math.fsum(self.rewards), math.fsum(self.recorded.rewards)
         gaps = [  # as far as both go

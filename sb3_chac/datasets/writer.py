@@ -100,7 +100,6 @@ def folder_to_make(dataset: str | os.PathLike[str], overwrite: bool) -> Path:
     Find the folder of a dataset that is to be made.
 
     :param dataset: id for Minari's folder, or the folder to make: an absolute one, or one that begins with "."
-    :return: the folder of the dataset
     :raises DatasetError: for an id that Minari does not take, or a name that is taken
     """
     name = os.fspath(dataset)
@@ -130,11 +129,7 @@ def check_free(folder: Path, overwrite: bool) -> None:
 
 
 def dataset_id_of(folder: Path) -> str:
-    """
-    Return the id of a dataset.
-
-    :return: the id under which Minari finds the dataset, or if it is kept elsewhere the name of its folder, as an id of Minari
-    """
+    """Return the id under which Minari finds a dataset, or if it is kept elsewhere the name of its folder as such an id."""
     root = minari_folder().absolute()
     if folder.is_relative_to(root):
         return folder.relative_to(root).as_posix()
@@ -154,9 +149,9 @@ def make_namespace(dataset_id: str) -> None:
 
 def storable_spec(env: gym.Env) -> EnvSpec | None:
     """
-    Describe how to make an environment again.
+    Describe how to make an environment again, without those who take over.
 
-    :return: how to make the environment again, without those who take over; None if that cannot be written down
+    :return: None if that cannot be written down
     """
     spec = env.spec
     if spec is None:

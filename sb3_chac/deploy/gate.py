@@ -31,7 +31,7 @@ class State(IntEnum):
 
 
 class Fault(IntFlag):
-    """Why an action of the policy was not taken."""
+    """Reasons for which an action of the policy was not taken."""
 
     NONE = 0
     OBSERVATION = 1  # invalid: shape, NaN, out of range

@@ -71,11 +71,7 @@ class PolicyServer:
             due = now + self.period
 
     def receive(self) -> Observed | None:
-        """
-        Receive the newest observation.
-
-        :return: the newest observation that waits, None if there is none
-        """
+        """Receive the newest observation that waits, None if there is none."""
         newest = None
         for data, sender in received_from(self.sock):
             if sender[0] != (self.allowed or (self.vehicle or sender)[0]):

@@ -11,7 +11,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule, TensorDict
 
 from sb3_chac.common.arguments import checked
-from sb3_chac.common.buffers import DualReplayBuffer, DualReplayBufferSamples, take_rows
+from sb3_chac.common.buffers import DualReplayBuffer, DualReplayBufferSamples, taken_over
 from sb3_chac.common.checks import check_range
 from sb3_chac.common.distributional import gaussian_surrogate_loss
 from sb3_chac.common.guided import GuidedOffPolicyAlgorithm
@@ -234,13 +234,12 @@ class DPVP(GuidedOffPolicyAlgorithm, DSAC):
         loss = losses.mean(dim=1).sum()
 
         # Labels, on the human's rows only
-        human = batch.takeovers.flatten().nonzero().flatten()
-        if len(human) > 0:
-            q_human, std_human = q_values[:, human], stds[:, human]
-            q_novice, std_novice = self.critic(take_rows(batch.observations, human), batch.novice_actions[human])
-            differ = (batch.actions - batch.novice_actions)[human].square().mean(dim=1).sqrt() >= self.pv_min_diff
+        human = taken_over(batch, self.pv_min_diff)
+        if len(human.rows) > 0:
+            q_human, std_human = q_values[:, human.rows], stds[:, human.rows]
+            q_novice, std_novice = self.critic(human.observations, human.novice_actions)
             human_losses = self._label_losses(q_human, std_human, self.proxy_value)
-            novice_losses = self._label_losses(q_novice, std_novice, -self.proxy_value) * differ
+            novice_losses = self._label_losses(q_novice, std_novice, -self.proxy_value) * human.differ
             loss = loss + self.pv_coef * (human_losses + novice_losses).sum() / len(batch.takeovers)
             stats |= {"q_human": q_human.detach().mean(), "q_novice": q_novice.detach().mean()}
         minimize(loss, self.critic.optimizer)

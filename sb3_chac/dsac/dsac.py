@@ -215,15 +215,11 @@ class DSAC(CheckedOffPolicyAlgorithm):
             self.ent_coef_optimizer = th.optim.Adam([parameter], lr=self.ent_coef_lr_schedule(1.0), fused=True)
 
     def _current_ent_coef(self) -> th.Tensor:
-        """
-        Return the entropy coefficient.
-
-        :return: alpha, shape (1,)
-        """
+        """Return the entropy coefficient alpha, shape (1,)."""
         return self.ent_coef_tensor if self.log_ent_coef is None else self.log_ent_coef.detach().exp()
 
     def _optimizers(self) -> list[th.optim.Optimizer]:
-        """Those that follow ``learning_rate``."""
+        """Return the optimizers that follow ``learning_rate``."""
         return [self.actor.optimizer, self.critic.optimizer]
 
     def _create_aliases(self) -> None:

@@ -213,7 +213,7 @@ def interquartile_mean(values: np.ndarray) -> Score | None:
     scores = values[:, None]  # one task
     if len(values) == 1:
         return Score(float(values[0]))
-    _, low, high = _estimate(scores, lambda x: np.array([aggregate_iqm(x)]))
+    _, low, high = estimate(scores, lambda x: np.array([aggregate_iqm(x)]))
     return Score(float(aggregate_iqm(scores)), low, high)
 
 
@@ -232,14 +232,16 @@ def probability_of_improvement(better: np.ndarray, worse: np.ndarray) -> Score |
     x, y = better[:, None], worse[:, None]
     if len(better) == len(worse) == 1:
         return Score(float(probability(x, y)))
-    value, low, high = _estimate((x, y), lambda x, y: np.array([probability(x, y)]))
+    value, low, high = estimate((x, y), lambda x, y: np.array([probability(x, y)]))
     return Score(value, low, high)
 
 
-def _estimate(scores: np.ndarray | tuple[np.ndarray, np.ndarray], function: Callable[..., np.ndarray]) -> tuple[float, ...]:
+def estimate(scores: np.ndarray | tuple[np.ndarray, np.ndarray], function: Callable[..., np.ndarray]) -> tuple[float, ...]:
     """
-    Estimate the interquartile mean.
+    Estimate a statistic of scores and its uncertainty.
 
+    :param scores: shape (n_runs, n_tasks), or a pair of such
+    :param function: of the scores, returns the statistic, shape (1,)
     :return: value, and the ends of its 95 % stratified bootstrap interval
     """
     from rliable.library import get_interval_estimates

@@ -133,10 +133,9 @@ class SavedModel(NamedTuple):
 
     def load(self, env: gym.Env) -> BaseAlgorithm:
         """
-        Load the model for acting.
+        Load the model on the CPU, fit for acting only.
 
         :param env: its spaces must be the model's; HER does not load without one
-        :return: the model, on the CPU, fit for acting only
         """
         env_of_model = DummyVecEnv([lambda: env])
         model = self.algorithm.load(io.BytesIO(self.archive), env_of_model, device="cpu", custom_objects=NOT_FOR_ACTING)
@@ -252,11 +251,7 @@ class Runner:
         return action
 
     def seed(self, number: int) -> int:
-        """
-        Derive the seed of an episode.
-
-        :return: seed of one episode, from the task's seed and the number of the episode alone
-        """
+        """Derive the seed of an episode from the task's seed and the number of the episode alone."""
         return int(np.random.SeedSequence([self.task.seed, number]).generate_state(1)[0])
 
     def reset(self, number: int) -> Any:

@@ -80,19 +80,11 @@ class Evaluation:
         return "\n".join(lines)
 
     def to_dict(self) -> dict[str, Any]:
-        """
-        Collect summary, settings and records.
-
-        :return: summary, settings and records; what an episode does not have is left out
-        """
+        """Collect summary, settings and records. What an episode does not have is left out."""
         return {**self.summary(), **self.settings, "records": self.records}
 
     def to_json(self) -> str:
-        """
-        Write ``to_dict`` as JSON.
-
-        :return: ``to_dict`` as strict JSON (no NaN)
-        """
+        """Write ``to_dict`` as strict JSON (no NaN)."""
         return json.dumps(self.to_dict(), indent=2, allow_nan=False, default=repr)
 
 

@@ -163,7 +163,7 @@ def find_normalization(model: Path, env_id: str, env: gym.Env) -> tuple[Path, Ve
     Find the statistics of a model's observations.
 
     :param env: that the model fits
-    :return: where RL-Zoo3 leaves the statistics of a model's observations, and the VecNormalize there, None if there is none
+    :return: where RL-Zoo3 leaves them, and the VecNormalize there, None if there is none
     :raises NotEvaluable: if the file cannot be read, or holds numbers that are NaN or infinite
     """
     path = model.parent / EnvironmentName(env_id.rpartition(":")[2]) / "vecnormalize.pkl"

@@ -316,11 +316,7 @@ class InterventionWrapper(contract.TakeoverWrapper, RecordConstructorArgs):
         return self.env.render()
 
     def state_dict(self) -> dict[str, int]:
-        """
-        Return the counts.
-
-        :return: the counts, to go on with the same budget after a restart
-        """
+        """Return the counts, to go on with the same budget after a restart."""
         return {"human_steps": self._human_steps, "total_steps": self._total_steps}
 
     def load_state_dict(self, state_dict: dict[str, int]) -> None:

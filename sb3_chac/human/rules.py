@@ -32,7 +32,6 @@ class TakeoverRule(Protocol):
         :param novice_action: in the units of the environment
         :param expert_action: in the units of the environment
         :param human_driving: whether the human drove the step before
-        :return: whether the human drives this step
         """
 
 
@@ -175,7 +174,6 @@ def make_rule(rule: Any, env: gym.Env, expert: Any, rule_kwargs: dict[str, Any] 
     :param env: the environment, for its action space
     :param expert: the expert of the environment, from ``make_expert``
     :param rule_kwargs: of "risk" (e.g. take_over_below) or "disagreement" (threshold)
-    :return: the rule
     :raises ValueError: for anything else, and for "risk" if the expert has no ``time_to_trouble``
     """
     check_rule(rule, expert, rule_kwargs)

@@ -10,7 +10,7 @@ from stable_baselines3.common.utils import polyak_update
 from stable_baselines3.td3.policies import TD3Policy
 
 from sb3_chac.common.arguments import checked
-from sb3_chac.common.buffers import DualReplayBuffer, DualReplayBufferSamples, take_rows
+from sb3_chac.common.buffers import DualReplayBuffer, DualReplayBufferSamples, taken_over
 from sb3_chac.common.checks import check_integer, check_range
 from sb3_chac.common.guided import GuidedOffPolicyAlgorithm
 from sb3_chac.common.utils import frozen, minimize, policy_arguments
@@ -207,13 +207,12 @@ class PVP(GuidedOffPolicyAlgorithm, TD3):
         loss = td_errors.mean(dim=0).sum()
         stats = {"q_mean": q_values.mean()}
 
-        human = batch.takeovers.flatten().nonzero().flatten()
-        if len(human) > 0:
-            q_human, novice_actions = q_values[human], batch.novice_actions[human]
-            q_novice = th.cat(self.critic(take_rows(batch.observations, human), novice_actions), dim=1)
-            differences = (batch.actions[human] - novice_actions).square().mean(dim=1, keepdim=True).sqrt()
+        human = taken_over(batch, self.pv_min_diff)
+        if len(human.rows) > 0:
+            q_human = q_values[human.rows]
+            q_novice = th.cat(self.critic(human.observations, human.novice_actions), dim=1)
             labels = (q_human - self.proxy_value).square()
-            labels = labels + (q_novice + self.proxy_value).square() * (differences >= self.pv_min_diff)
+            labels = labels + (q_novice + self.proxy_value).square() * human.differ.unsqueeze(1)
             loss = loss + self.pv_coef * labels.sum() / len(q_values)
             stats |= {"q_human": q_human.mean(), "q_novice": q_novice.mean()}
         minimize(loss, self.critic.optimizer)

@@ -76,11 +76,7 @@ def sample_chac_params(trial: optuna.Trial, n_actions: int, n_envs: int, additio
 
 
 def _suggest_guided(trial: optuna.Trial) -> dict[str, Any]:
-    """
-    Suggest what all algorithms that learn from takeovers have in common.
-
-    :return: what all algorithms that learn from takeovers have in common, before the conversion
-    """
+    """Suggest what all algorithms that learn from takeovers have in common, before the conversion."""
     params: dict[str, Any] = {
         "one_minus_gamma": trial.suggest_float("one_minus_gamma", 0.003, 0.1, log=True),
         "batch_size_pow": trial.suggest_int("batch_size_pow", 6, 9),  # 64 to 512
@@ -116,9 +112,9 @@ def sample_sac_lag_params(trial: optuna.Trial, n_actions: int, n_envs: int, addi
 
 def sample_ppo_lag_params(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> dict[str, Any]:
     """
-    For ``cost_limit`` see ``sample_sac_lag_params``.
+    Sample hyperparameters of PPOLag. For ``cost_limit`` see ``sample_sac_lag_params``.
 
-    :return: keyword arguments of PPOLag. For the parameters see ``sample_dsac_params``
+    :return: keyword arguments. For the parameters see ``sample_dsac_params``
     """
     return sample_ppo_params(trial, n_actions, n_envs, additional_args) | _suggest_multiplier(trial)
 

@@ -36,6 +36,18 @@ class Wish(NamedTuple):
     number: int = 0
 
 
+def read_json(text: str) -> Any:
+    """
+    Read what the page says.
+
+    :raises BadMessage: if it is no JSON
+    """
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise BadMessage("no JSON") from error
+
+
 def parse(text: str) -> Held | Wish:
     """
     Parse a message of the page.
@@ -44,11 +56,7 @@ def parse(text: str) -> Held | Wish:
         ``{"wish": name}`` or ``{"ping": number}``
     :raises BadMessage: for everything else
     """
-    try:
-        data = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise BadMessage("no JSON") from error
-    match data:
+    match data := read_json(text):
         case {"keys": list(keys), "gamepad": gamepad, **more} if set(more) <= {"touch"}:
             if len(keys) > len(KEYS) or not all(isinstance(key, str) and key in KEYS for key in keys):
                 raise BadMessage("unknown keys")
@@ -99,7 +107,7 @@ class Browser:
         self.go_away()
 
     def go_away(self) -> None:
-        """Whoever is there looks elsewhere, until the next message."""
+        """Take it that whoever is there looks elsewhere, until the next message."""
         self.ramps.stop()
         self.gamepad: tuple[float, ...] | None = None
         self.touch: tuple[float, ...] | None = None

@@ -78,10 +78,9 @@ class Calibration:
 
     def _moved(self, before: dict[int, float], after: dict[int, float], step: str = "") -> tuple[int, float]:
         """
-        Find the axis that moved.
+        Find the axis that moved most, and by how much.
 
-        :return: the axis that moved most, and by how much. Where it was before its first event is not known: what is
-            seen later tells
+        Where it was before its first event is not known: what is seen later tells.
         """
         steering = self._moved(self._noted["left"], self._noted["right"])[0] if step else None
         # A pedal that was never touched: SDL tells nothing of it; its other end is taken
@@ -97,7 +96,6 @@ class Calibration:
         """
         Return the configuration that the answers make.
 
-        :return: what was found out
         :raises DeviceError: if a question is open
         """
         if self.step is not None:

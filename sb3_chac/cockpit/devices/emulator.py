@@ -69,7 +69,7 @@ class DeviceEmulator:
         self._post(pygame.WINDOWFOCUSGAINED)
 
     def open_joystick(self, device_index: int) -> EmulatedJoystick:
-        """For ``Joystick(..., open_joystick=emulator.open_joystick)``."""
+        """Open the joystick, for ``Joystick(..., open_joystick=emulator.open_joystick)``."""
         return self.joystick
 
     def plug(self) -> None:

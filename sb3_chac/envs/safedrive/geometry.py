@@ -47,8 +47,7 @@ class Segment(NamedTuple):
         """
         Return the parallel segment.
 
-        :param right: [m]
-        :return: the parallel segment at that distance to the right
+        :param right: [m] how far to the right it is
         """
         shrink = 1 - right * self.curvature
         return Segment(self.length * shrink, self.curvature / shrink)
@@ -84,7 +83,7 @@ def sample(start: Pose, segments: list[Segment]) -> np.ndarray:
     """
     Sample points along segments.
 
-    :return: points every ``SPACING`` along the segments, shape (n, 4): x, y, heading, curvature
+    :return: one every ``SPACING``, shape (n, 4): x, y, heading, curvature
     """
     starts = np.cumsum([0.0, *(segment.length for segment in segments)])
     s = np.arange(0, starts[-1], SPACING)

@@ -219,9 +219,9 @@ def strip(poses: np.ndarray, left: float, right: float) -> np.ndarray:
 
 def strips(start: Pose, segments: list[Segment], left: float, right: float) -> list[np.ndarray]:
     """
-    Make the area between two parallels in pieces.
+    Make the area between two parallels of a line in pieces.
 
-    :return: pieces, each with its shape (n, 2), of the area between two parallels of a line
+    :return: each with its shape (n, 2)
     """
     poses = along(start, segments)
     pieces = [poses[i : i + CHUNK + 1] for i in range(0, len(poses) - 1, CHUNK)]
@@ -244,7 +244,7 @@ def _line(right: float) -> tuple[float, float]:
 
 
 def _markings(start: Pose, segments: list[Segment], without_right: bool = False) -> list[np.ndarray]:
-    """Of one carriageway: lines at its edges, a broken one between its lanes."""
+    """Markings of one carriageway: lines at its edges, a broken one between its lanes."""
     markings = dashes(start, segments, 0.0) + strips(start, segments, *_line(EDGE - HALF_WIDTH))
     return markings if without_right else markings + strips(start, segments, *_line(HALF_WIDTH - EDGE))
 

@@ -185,10 +185,9 @@ class Traffic:
 
     def _would_hit(self, path, s, lateral, positions, headings) -> np.ndarray:
         """
-        Find the cars that must not move.
+        Find the cars that must not move, as they would touch another one that they do not touch yet.
 
         :param positions: of the cars before their move, and of the ego
-        :return: cars that must not move, as they would touch another one that they do not touch yet
         """
         n = len(s)
         moved, moved_headings = _poses(*self._tables, path, s, lateral)
@@ -229,9 +228,9 @@ def _poses(points, first, last, path, s, lateral):
 @compiled
 def _visible(points, first, last, path, s, lateral, state):
     """
-    Find the cars that are there.
+    Find the cars of the map that are there.
 
-    :return: indices, positions and headings of the cars of the map that are there
+    :return: their indices, positions and headings
     """
     cars = np.flatnonzero((state == DRIVING) | (state == CRASHED))
     positions, headings = _poses(points, first, last, path[cars], s[cars], lateral[cars])
