@@ -8,12 +8,12 @@ from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 
-from sb3_chac.bc.policies import LOSSES, BCPolicy, CnnPolicy, MlpPolicy
+from sb3_chac.bc.policies import BCPolicy, CnnPolicy, MlpPolicy, check_loss, imitating_policy
 from sb3_chac.common.arguments import checked
 from sb3_chac.common.checks import check_range
 from sb3_chac.common.demonstrations import Dataset
 from sb3_chac.common.offline import Batch, OfflineAlgorithm
-from sb3_chac.common.utils import minimize, policy_arguments
+from sb3_chac.common.utils import minimize
 
 SelfBC = TypeVar("SelfBC", bound="BC")
 
@@ -98,16 +98,12 @@ class BC(OfflineAlgorithm):
             self.set_dataset(dataset)
 
     def _setup_model(self) -> None:
-        self.policy_kwargs = {key: value for key, value in self.policy_kwargs.items() if key != "stochastic"}  # once stored
-        with policy_arguments(self, stochastic=self.loss == "nll"):
+        with imitating_policy(self, self.loss, self.weight_decay):
             super()._setup_model()
-        for group in self.policy.optimizer.param_groups:
-            group["weight_decay"] = self.weight_decay
 
     def _check_arguments(self) -> None:
         super()._check_arguments()
-        if self.loss not in LOSSES:
-            raise ValueError(f"loss must be one of {', '.join(LOSSES)}, got {self.loss!r}.")
+        check_loss(self.loss)
         if isinstance(self.action_space, spaces.Discrete) and self.loss != "nll":
             raise ValueError(f"loss must be 'nll' for {self.action_space}, got {self.loss!r}.")
         check_range("weight_decay", self.weight_decay, low=0.0)

@@ -1,10 +1,13 @@
 """Policies that are fitted to demonstrations, of BC, HG-DAgger and IWR."""
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any, ClassVar
 
 import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor, NatureCNN, create_mlp
@@ -12,8 +15,36 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 from torch.nn import functional as F
 
+from sb3_chac.common.utils import policy_arguments
+
 LOSSES = ("mse", "nll")
 LOG_STD_MIN, LOG_STD_MAX = -5.0, 2.0
+
+
+def check_loss(loss: str) -> None:
+    """
+    Check the argument ``loss``.
+
+    :raises ValueError: if it is not one of ``LOSSES``
+    """
+    if loss not in LOSSES:
+        raise ValueError(f"loss must be one of {', '.join(LOSSES)}, got {loss!r}.")
+
+
+@contextmanager
+def imitating_policy(model: BaseAlgorithm, loss: str, weight_decay: float) -> Iterator[None]:
+    """
+    Build the policy of an algorithm that imitates inside the block.
+
+    :param model: whose policy it is
+    :param loss: of ``LOSSES``; the policy is stochastic for "nll"
+    :param weight_decay: of its optimizer
+    """
+    model.policy_kwargs = {key: value for key, value in model.policy_kwargs.items() if key != "stochastic"}  # once stored
+    with policy_arguments(model, stochastic=loss == "nll"):
+        yield
+    for group in model.policy.optimizer.param_groups:
+        group["weight_decay"] = weight_decay
 
 
 class BCPolicy(BasePolicy):

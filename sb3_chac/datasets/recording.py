@@ -36,7 +36,7 @@ from sb3_chac.common.demonstrations import check_spaces
 from sb3_chac.common.minari_datasets import DatasetError
 from sb3_chac.datasets.writer import DatasetWriter, folder_to_make
 from sb3_chac.evaluation.episodes import Runner, SavedModel, Task, make_env
-from sb3_chac.evaluation.evaluation import policy_name, saved_model, scenario_list
+from sb3_chac.evaluation.evaluation import policy_name, scenario_list, task_of_processes
 from sb3_chac.human.intervention import InterventionWrapper
 
 if TYPE_CHECKING:
@@ -269,11 +269,7 @@ def recorded_episodes(recorder: Recorder, jobs: int) -> Generator["EpisodeBuffer
     if jobs == 1:
         yield from map(recorder.record, itertools.count())
         return
-    task = recorder.task
-    if isinstance(task.env, str) and recorder.env.spec is not None:
-        task = task._replace(env=recorder.env.spec)  # the processes need not know the id
-    if isinstance(task.policy, BaseAlgorithm):
-        task = task._replace(policy=saved_model(task.policy))
+    task = task_of_processes(recorder)
     context = multiprocessing.get_context("spawn")
     arguments = (CloudpickleWrapper(task), recorder.scenarios)
     queue: deque[Future[EpisodeBuffer]] = deque()

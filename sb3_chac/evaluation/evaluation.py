@@ -220,14 +220,24 @@ def _episodes(runner: Runner, numbers: list[int], jobs: int) -> Iterator[tuple[d
     if jobs == 1 or len(numbers) == 1:
         yield from map(runner.episode, numbers)
         return
-    task = runner.task
-    if isinstance(task.env, str) and runner.env.spec is not None:
-        task = task._replace(env=runner.env.spec)  # the processes need not know the id
-    if isinstance(task.policy, BaseAlgorithm):
-        task = task._replace(policy=saved_model(task.policy))
+    task = task_of_processes(runner)
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(min(jobs, len(numbers)), context, _start_process, (CloudpickleWrapper(task),)) as pool:
         yield from pool.map(_run_episode, numbers)
+
+
+def task_of_processes(runner: Runner) -> Task:
+    """
+    Return the task of a runner in a form that can be sent to other processes, which need not know the environment's id.
+
+    :param runner: that has found that the task fits
+    """
+    task = runner.task
+    if isinstance(task.env, str) and runner.env.spec is not None:
+        task = task._replace(env=runner.env.spec)
+    if isinstance(task.policy, BaseAlgorithm):
+        task = task._replace(policy=saved_model(task.policy))
+    return task
 
 
 def saved_model(model: BaseAlgorithm) -> SavedModel:

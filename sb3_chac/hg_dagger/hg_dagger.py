@@ -13,13 +13,13 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn, Schedule, TrainFreq
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_chac.bc.policies import LOSSES, BCPolicy, CnnPolicy, MlpPolicy
+from sb3_chac.bc.policies import BCPolicy, CnnPolicy, MlpPolicy, check_loss, imitating_policy
 from sb3_chac.common.arguments import checked
 from sb3_chac.common.buffers import DualReplayBuffer, TransitionStore
 from sb3_chac.common.checks import check_integer, check_range
 from sb3_chac.common.demonstrations import Dataset, check_spaces
 from sb3_chac.common.guided import GuidedOffPolicyAlgorithm
-from sb3_chac.common.utils import fix_statistics, minimize, policy_arguments
+from sb3_chac.common.utils import fix_statistics, minimize
 
 SelfHGDagger = TypeVar("SelfHGDagger", bound="HGDagger")
 
@@ -139,11 +139,8 @@ class HGDagger(GuidedOffPolicyAlgorithm):
                 self.store_demonstrations(dataset)
 
     def _setup_model(self) -> None:
-        self.policy_kwargs = {key: value for key, value in self.policy_kwargs.items() if key != "stochastic"}  # once stored
-        with policy_arguments(self, stochastic=self.loss == "nll"):
+        with imitating_policy(self, self.loss, self.weight_decay):
             super()._setup_model()
-        for group in self.policy.optimizer.param_groups:
-            group["weight_decay"] = self.weight_decay
 
     def _check_arguments(self) -> None:
         super()._check_arguments()
@@ -152,8 +149,7 @@ class HGDagger(GuidedOffPolicyAlgorithm):
         check_integer("n_epochs", self.n_epochs, low=1)
         if self.n_rounds is not None:
             check_integer("n_rounds", self.n_rounds, low=0)
-        if self.loss not in LOSSES:
-            raise ValueError(f"loss must be one of {', '.join(LOSSES)}, got {self.loss!r}.")
+        check_loss(self.loss)
         check_range("weight_decay", self.weight_decay, low=0.0)
 
     @staticmethod
