@@ -304,9 +304,11 @@ def test_nothing_overlaps_or_leaves_the_view_in_any_size(served, all_sizes):
                 "viewport": dict(zip(("width", "height"), sizes[0], strict=True)),
             }
             with opened(browser, served, **context) as page:
+                served.server.asking = [served.server.viewers[0]]  # somebody asks for the wheel
                 served.drive.show(novice=novice, speed=33.3, route=1.0)
                 served.drive.count(episode=12_345, **numbers)
                 shows(page, "total-step-value", "1234567")
+                shows(page, "wheel", "Somebody asks for the wheel: hand over")
                 for width, height in sizes:
                     page.set_viewport_size({"width": width, "height": height})
                     wait_until(lambda: page.evaluate("[innerWidth, innerHeight]") == [width, height], pause=0.02)  # noqa: B023
@@ -372,6 +374,21 @@ def test_two_thumbs_drive_and_a_collision_is_felt(served):
         page.evaluate(f"() => {{ const view = document.getElementById('view'); {seen} }}")
         served.drive.count(collisions=served.drive.totals.collisions + 1)
         wait_until(lambda: page.evaluate("window.vibrated === 200 && window.flashes >= 2"))  # it came and went
+
+
+@needs_chromium
+def test_the_wheel_is_handed_over_between_two_pages(served):
+    size = {"width": 800, "height": 600}
+    with chromium() as browser, opened(browser, served, viewport=size) as first:
+        second = browser.new_page(viewport=size)
+        second.goto(served.server.access.url(served.server.access.driver_token))
+        shows(second, "role", "Somebody else is at the wheel: you watch")
+        shows(first, "watching", "1 watch")
+        second.click("text=Ask for the wheel")
+        first.click("text=Somebody asks for the wheel: hand over")
+        shows(second, "role", "You are at the wheel")
+        shows(first, "wheel", "Ask for the wheel")
+        assert not second.locator("#wheel").is_visible()
 
 
 @needs_chromium

@@ -253,7 +253,7 @@ def lost_message(device: str) -> str:
     :return: what to tell a person whose device is gone
     """
     if device == "browser":
-        return "Nobody is at the wheel: open the page, or click into it; then P goes on"
+        return "Nobody is at the wheel: open the page, or click into it; then Begin or P goes on"
     if device == "keyboard":
         return "The window has lost the keyboard: click into it, then P goes on"
     return f"No {device}: plug it in, or press K for the keyboard; then P goes on"

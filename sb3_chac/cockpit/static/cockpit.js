@@ -32,6 +32,7 @@ let pings = 0;
 let toldAt = 0;
 let collisions = null;
 let asks = false; // whether the novice asks for help
+let isAsked = false; // whether somebody asks the driver for the wheel
 const socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/ws${location.search}`);
 socket.binaryType = "blob";
 
@@ -207,7 +208,7 @@ for (const button of document.querySelectorAll("[data-wish]")) {
   onClick(button, wish === "quit" ? quitTwice : () => ask(wish));
 }
 for (const button of document.querySelectorAll("[data-opens]")) onClick(button, () => open(button.dataset.opens));
-onClick(byId("wheel"), () => send({ wish: "wheel" }));
+onClick(byId("wheel"), () => send({ wish: role === "driver" ? "hand_over" : "wheel" }));
 setInterval(tellHeld, HEARTBEAT);
 setInterval(() => {
   sentAt.set(++pings, performance.now());
@@ -338,6 +339,26 @@ function showQuery(isAsking) {
   document.body.classList.toggle("asks", asks);
 }
 
+/** The button with which the wheel is taken, asked for and handed over. */
+function showWheel(state) {
+  const wheel = byId("wheel");
+  const handOver = state.wants ? "Somebody asks for the wheel: hand back first" : "Somebody asks for the wheel: hand over";
+  const texts = {
+    free: "Take the wheel",
+    taken: state.asking ? "You have asked for the wheel: ask no longer" : "Ask for the wheel",
+    driver: state.is_asked ? handOver : "",
+  };
+  setText(wheel, texts[role] ?? "");
+  wheel.hidden = !wheel.textContent;
+  wheel.disabled = role === "driver" && state.wants;
+  if (state.is_asked && !isAsked) {
+    vibrate(120);
+    if (options.sound) beep(440);
+  }
+  isAsked = state.is_asked;
+  setText(byId("watching"), state.watching ? `${state.watching} watch` : "");
+}
+
 function showCollisions(number) {
   if (collisions !== null && number > collisions) {
     byId("view").classList.add("hit");
@@ -438,9 +459,10 @@ function show(state) {
   showForm(state.form);
   document.body.dataset.driver = state.driver;
   const told = state.driver === "person" && role === "driver" ? "You drive" : DRIVERS[state.driver];
-  setText(byId("told"), state.asks ? "The novice asks for help" : told);
+  const wheelToo = state.is_asked ? `${told}. Somebody asks for the wheel` : told;
+  setText(byId("told"), state.asks ? "The novice asks for help" : wheelToo);
   setText(byId("role"), ROLES[role]);
-  byId("wheel").hidden = role !== "free";
+  showWheel(state);
   byId("notice").hidden = !state.notice;
   setText(byId("notice"), state.notice);
   byId("notice").classList.toggle("waits", state.waits);
@@ -488,6 +510,7 @@ socket.addEventListener("close", ({ code, reason }) => {
   showForm(null);
   role = "";
   document.body.dataset.driver = "unknown";
+  byId("wheel").hidden = true;
   byId("notice").hidden = false;
   const lost = `Not connected${reason ? `: ${reason}` : ""}. Reload the page to connect again`;
   byId("notice").textContent = code === 1001 && reason ? reason : lost; // it went away in good order
