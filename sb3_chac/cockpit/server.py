@@ -342,6 +342,8 @@ class Server:
             "indicators": indicators(display, drive.totals, drive.lag, now.connected, role != "driver"),
             "confidence": display.novice.confidence,
             "risk": display.novice.risk,
+            "route": display.route,
+            "corridors": drive.corridors,
             "asks": asks_for_help(display, driver),
             "proposed": display.proposed,
             "applied": display.applied,

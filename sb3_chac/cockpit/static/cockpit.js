@@ -11,7 +11,8 @@ const KEYS = {
   ArrowLeft: "left", KeyA: "left", ArrowRight: "right", KeyD: "right",
   ArrowUp: "up", KeyW: "up", ArrowDown: "down", KeyS: "down",
 };
-const WISHES = { Space: "takeover", KeyP: "pause", KeyN: "skip", KeyQ: "quit" };
+const WISHES = { Space: "takeover", KeyP: "pause", KeyN: "skip", KeyQ: "quit", KeyC: "corridors" };
+const METERS = ["route", "confidence", "risk"]; // indicators with a bar
 const BUTTONS = { 0: "takeover", 9: "pause", 8: "skip" }; // of a gamepad with the standard mapping
 const ROLES = {
   driver: "You are at the wheel",
@@ -209,6 +210,7 @@ for (const button of document.querySelectorAll("[data-wish]")) {
 }
 for (const button of document.querySelectorAll("[data-opens]")) onClick(button, () => open(button.dataset.opens));
 onClick(byId("wheel"), () => send({ wish: role === "driver" ? "hand_over" : "wheel" }));
+byId("corridors").addEventListener("change", () => ask("corridors"));
 setInterval(tellHeld, HEARTBEAT);
 setInterval(() => {
   sentAt.set(++pings, performance.now());
@@ -251,6 +253,8 @@ function makePad(name, value) {
     tellSoon();
   });
   for (const kind of ["pointerup", "pointercancel", "lostpointercapture"]) pad.addEventListener(kind, end);
+  // Else a Chromium, in wait of a gesture, lets messages of the server lie for 100 ms
+  pad.addEventListener("touchstart", (event) => event.preventDefault(), { passive: false });
   pad.addEventListener("contextmenu", (event) => event.preventDefault());
 }
 
@@ -311,7 +315,7 @@ function makeCell(name) {
   const value = document.createElement("dd");
   value.id = `${name.replaceAll(" ", "-")}-value`;
   cell.append(term, value);
-  if (name === "confidence" || name === "risk") {
+  if (METERS.includes(name)) {
     const meter = document.createElement("dd");
     meter.className = "meter";
     meter.id = `${name}-bar`;
@@ -469,11 +473,13 @@ function show(state) {
   const list = byId("indicators");
   if (list.childElementCount !== state.indicators.length) list.replaceChildren(...state.indicators.map(([name]) => makeCell(name)));
   for (const [name, value] of state.indicators) setText(byId(`${name.replaceAll(" ", "-")}-value`), value);
-  for (const name of ["confidence", "risk"]) {
+  for (const name of METERS) {
     byId(`${name}-bar`).hidden = state[name] === null;
     byId(`${name}-bar`).firstElementChild.style.width = `${100 * (state[name] ?? 0)}%`;
   }
   showQuery(state.asks);
+  byId("corridors").disabled = role !== "driver" || state.corridors === null;
+  byId("corridors").checked = state.corridors === true;
   for (const name of Object.keys(bars)) bars[name].forEach((set, i) => set(state[name][i]));
   for (const button of document.querySelectorAll("[data-wish]")) button.disabled = role !== "driver";
   const mayDrive = role === "driver" && state.may_take_over;
