@@ -3,6 +3,7 @@
     python benchmarks/cockpit.py drive --minutes 10          # C-HAC on SafeDrive-v0, through both stages
     python benchmarks/cockpit.py drive --env MetaDriveSafety-v0
     python benchmarks/cockpit.py browser --minutes 3         # the same in a Chromium, served on loopback
+    python benchmarks/cockpit.py start --times 5            # how long until the first picture of 'sb3-chac drive'
     python benchmarks/cockpit.py report
     python benchmarks/cockpit.py pictures                    # of the guide; of the page too if there is a Chromium
 
@@ -10,16 +11,20 @@ An emulated person presses and lets go keys at random moments, takes over and ha
 does, with SDL's dummy display. Two CSVs in benchmarks/results/cockpit/ get a row per event and per step of the environment:
 <env>-events.csv, from the event in SDL's queue to the moment at which the environment begins the first step that is driven
 with it; <env>-steps.csv, the moments of the steps, the gradient steps that were owed, what the car waited for, and the
-window's frames. browser.csv gets a row per measured time: "round trip" of a message from the page and back; "shown", from a
-key to the page showing that the driving end has it; and "applied", until the page shows that it was driven; "touch shown" and
-"touch applied" are the same from a thumb that touches the throttle on the screen.
+window's frames. browser.csv gets a row per measured time: "round trip" of a message from the page and back; "action", from a
+key to the moment at which the environment begins the first step that is driven with it; "shown", from a key to the page
+showing that the driving end has it; and "applied", until the page shows that it was driven; "touch action", "touch shown" and
+"touch applied" are the same from a thumb that touches the throttle on the screen; "picture", between two pictures on the page.
+start.csv gets the seconds from the command to its address and to its first picture.
 It wants a machine with two cores that does nothing else; the load average is in the rows.
 """
 
 import asyncio
 import os
 import random
+import re
 import shutil
+import subprocess
 import sys
 import tempfile
 import threading
@@ -48,6 +53,7 @@ RESULTS = Path(__file__).parent / "results" / "cockpit"
 PICTURES = Path(command.__file__).parent / "cockpit" / "images"
 KEYS = (pygame.K_LEFT, pygame.K_RIGHT, pygame.K_UP, pygame.K_DOWN, pygame.K_SPACE)
 OLD = {"chac": ("--env-kwargs", "corridors:False")}  # without which this agent was trained
+MISSED = 1000.0  # [ms] after which a step was not driven with a key, but with the next one
 PERIOD = 0.1  # [s] of a step, as the environments say
 VERSIONS = lab.versions("sb3_chac", "torch", "numpy", "pygame-ce", "stable-baselines3")
 
@@ -108,7 +114,7 @@ def measure(env: str, minutes: float) -> None:
             while run.cockpit is None and not run.is_over:
                 time.sleep(0.01)
             assert run.cockpit is not None
-            vehicle = run.cockpit.wrapper
+            vehicle = run.cockpit.env
             step = vehicle.step
 
             def timed(action: np.ndarray) -> Any:
@@ -151,10 +157,24 @@ PING = """() => new Promise((resolve) => {
   send({ ping: 0 });
 })"""
 WATCH = """() => {
-  window.seen = { shown: [], applied: [], "touch shown": [], "touch applied": [] };
+  window.seen = { shown: [], applied: [], "touch shown": [], "touch applied": [], picture: [] };
+  window.presses = [];  // how, and when [ms since 1970]
   const begun = {};
   let by = "";
-  const begin = (how) => () => { by = how; begun.shown = begun.applied = performance.now(); };
+  const begin = (how) => (event) => {
+    if (event.repeat || event.code === "Space") return;
+    by = how;
+    begun.shown = begun.applied = performance.now();
+    window.presses.push([how, performance.timeOrigin + event.timeStamp]);
+  };
+  const drawn = draw;
+  let last = null;
+  window.draw = (blob) => {
+    const now = performance.now();
+    if (last !== null) window.seen.picture.push(now - last);
+    last = now;
+    return drawn(blob);
+  };
   addEventListener("keydown", begin(""), true);
   addEventListener("pointerdown", begin("touch "), true);
   for (const [kind, row] of [["shown", "input"], ["applied", "applied"]]) {
@@ -175,23 +195,37 @@ def measure_browser(env: str, minutes: float) -> None:
 
     device = Browser()
     rows: list[dict[str, Any]] = []
+    steps: list[tuple[float, bool]] = []  # [s] since 1970 when each began, and whether it was driven with the throttle
 
     def drive_in_chromium() -> None:
         from playwright.sync_api import sync_playwright
 
+        while run.cockpit is None and not run.is_over:
+            time.sleep(0.01)
+        assert run.cockpit is not None
+        vehicle = run.cockpit.env
+        step = vehicle.step
+
+        def timed(action: np.ndarray) -> Any:
+            now = run.drive.person.input
+            steps.append((time.time(), now.takeover and now.pedals > 0))
+            return step(action)
+
+        vehicle.step = timed  # type: ignore[method-assign]
         with sync_playwright() as playwright:
             browser = playwright.chromium.launch(executable_path=chromium(), args=["--no-sandbox"])
             page = browser.new_page(viewport={"width": 1200, "height": 780}, has_touch=True)
             page.goto(server.access.address.url(server.access.driver_token))
             page.wait_for_selector("text=You are at the wheel")
             page.keyboard.press("KeyP")
-            fingers, pedals = page.context.new_cdp_session(page), page.locator("#pedals").bounding_box()
-            assert pedals is not None
-            throttle = {"x": pedals["x"] + pedals["width"] / 2, "y": pedals["y"] + 1}
+            fingers = page.context.new_cdp_session(page)
             end = time.monotonic() + 60 * minutes
             rng = random.Random(0)
             page.evaluate(WATCH)
             while time.monotonic() < end:
+                if run.drive.paused:  # a busy machine has made the page fall silent
+                    page.keyboard.press("KeyP")
+                    time.sleep(0.5)
                 rows.extend({"kind": "round trip", "ms": page.evaluate(PING)} for _ in range(5))
                 page.keyboard.down("ArrowUp")  # takes over, too, where an episode has begun
                 time.sleep(rng.uniform(0.3, 0.4))
@@ -199,11 +233,18 @@ def measure_browser(env: str, minutes: float) -> None:
                 time.sleep(rng.uniform(0.6, 0.7))  # it is back in the middle
                 page.keyboard.press("Space")
                 time.sleep(rng.uniform(0.3, 0.4))
+                pedals = page.locator("#pedals").bounding_box()
+                assert pedals is not None
+                throttle = {"x": pedals["x"] + pedals["width"] / 2, "y": pedals["y"] + pedals["height"] / 10}
                 fingers.send("Input.dispatchTouchEvent", {"type": "touchStart", "touchPoints": [throttle]})
                 time.sleep(rng.uniform(0.3, 0.4))
                 fingers.send("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
                 time.sleep(rng.uniform(1.2, 1.3))  # handed back
             rows.extend({"kind": kind, "ms": value} for kind, values in page.evaluate("seen").items() for value in values)
+            for how, pressed in page.evaluate("presses"):
+                action = next((1000 * began - pressed for began, has_it in steps if has_it and 1000 * began > pressed), None)
+                if action is not None and action < MISSED:
+                    rows.append({"kind": f"{how}action", "ms": action})
             facts = {"load": round(os.getloadavg()[1], 2), "cores": os.cpu_count()}
             versions = {"versions": f"{VERSIONS} chromium={browser.version}"}
             rows[:] = [row | {"ms": round(row["ms"], 2)} | facts | versions for row in rows]
@@ -242,6 +283,12 @@ def write(env: str, steps: list[dict[str, Any]], events: list[float]) -> None:
 
 def report() -> None:
     """Prints the figures of the CSVs."""
+    if (RESULTS / "start.csv").exists():
+        rows = lab.read(RESULTS / "start.csv")
+        for until in ("address", "picture"):
+            seconds = np.array([float(row["seconds"]) for row in rows if row["until"] == until])
+            what = f"start [s]: {until} after {np.median(seconds):.1f} (least {seconds.min():.1f}, most {seconds.max():.1f})"
+            print(f"{what}, of {len(seconds)}, load average {rows[0]['load']}")
     if (RESULTS / "browser.csv").exists():
         report_browser()
     for file in sorted(RESULTS.glob("*-events.csv")):
@@ -266,12 +313,49 @@ def report() -> None:
 def report_browser() -> None:
     rows = lab.read(RESULTS / "browser.csv")
     print(f"Chromium on loopback, load average {rows[0]['load']}")
-    for kind in ("round trip", "shown", "applied", "touch shown", "touch applied"):
+    for kind in ("round trip", "action", "shown", "applied", "touch action", "touch shown", "touch applied", "picture"):
         times = np.array([float(row["ms"]) for row in rows if row["kind"] == kind])
         if len(times) == 0:
             continue
         p50, p99 = np.percentile(times, (50, 99))
         print(f"  {kind} [ms]: median {p50:.1f}, p99 {p99:.1f}, most {times.max():.1f}, of {len(times)}")
+
+
+def measure_start(times: int) -> None:
+    """
+    :param times: how often the command is begun
+    """
+    rows = []
+    command_line = [sys.executable, "-m", "sb3_chac", "drive", "--serve", "0", "--seed", "1"]
+    for _ in range(times):
+        with tempfile.TemporaryDirectory() as folder:
+            begun = time.monotonic()
+            environment = {**os.environ, "MINARI_DATASETS_PATH": folder}
+            process = subprocess.Popen(
+                [*command_line, "-f", folder], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, env=environment
+            )
+            assert process.stdout is not None
+            address = next(found[1] for line in process.stdout if (found := re.match(r"Drive at +(\S+)", line)))
+            rows.append({"until": "address", "seconds": round(time.monotonic() - begun, 2)})
+            asyncio.run(first_picture(address))
+            rows.append({"until": "picture", "seconds": round(time.monotonic() - begun, 2)})
+            process.terminate()
+            process.wait()
+    facts = {"load": round(os.getloadavg()[1], 2), "cores": os.cpu_count(), "versions": VERSIONS}
+    lab.write(RESULTS / "start.csv", [row | facts for row in rows])
+    report()
+
+
+async def first_picture(address: str) -> None:
+    """
+    :param address: of the page
+    """
+    import aiohttp
+
+    origin, _, query = address.partition("/?")
+    async with aiohttp.ClientSession() as session, session.ws_connect(f"{origin}/ws?{query}", origin=origin) as channel:
+        while (await channel.receive()).type is not aiohttp.WSMsgType.BINARY:
+            pass
 
 
 def pictures() -> None:
@@ -378,13 +462,16 @@ def pictures_of_the_page() -> None:
 
 
 if __name__ == "__main__":
-    parser = lab.make_parser(__doc__, ["drive", "browser", "report", "pictures"])
+    parser = lab.make_parser(__doc__, ["drive", "browser", "start", "report", "pictures"])
     parser.add_argument("--env", default="SafeDrive-v0", metavar="ID")
     parser.add_argument("--minutes", type=float, default=10.0)
+    parser.add_argument("--times", type=int, default=5)
     arguments = parser.parse_args()
     if arguments.command == "drive":
         measure(arguments.env, arguments.minutes)
     elif arguments.command == "browser":
         measure_browser(arguments.env, arguments.minutes)
+    elif arguments.command == "start":
+        measure_start(arguments.times)
     else:
         {"report": report, "pictures": pictures}[arguments.command]()

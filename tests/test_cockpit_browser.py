@@ -310,12 +310,14 @@ def test_spectators_and_second_drivers_only_watch(served):
                     for message in (
                         {"keys": ["right"], "gamepad": None},
                         {"wish": "wheel"},
+                        {"wish": "hand_over"},
                         {"wish": "pause"},
                         {"wish": "quit"},
                     ):
                         await channel.send_json(message)
                     await channel.send_json({"ping": 5})
                     await state_of(channel, lambda answer: answer.get("pong") == 5)  # all of it was heard
+                    assert len(served.server.asking) == (role == "taken")
                     await goes_on(served)
         assert np.allclose(served.car.executed, NOVICE)
 
@@ -334,6 +336,81 @@ def test_a_free_wheel_is_taken_by_asking(served):
                 await state_of(second, lambda state: state.get("role") == "driver")
 
     asyncio.run(take())
+
+
+@asynccontextmanager
+async def asking(served):
+    """Somebody at the wheel, and somebody else who has asked for it."""
+    async with driving(served) as driver, served.viewer() as second:
+        await second.send_json({"wish": "wheel"})
+        await state_of(driver.channel, lambda state: state.get("is_asked"))
+        assert (await state_of(second, lambda state: state.get("asking")))["role"] == "taken"
+        yield driver, second
+
+
+def test_the_driver_hands_the_wheel_over_to_who_has_asked_for_it(served):
+    async def hand_over():
+        async with asking(served) as (driver, second), served.viewer() as third:
+            await third.send_json({"wish": "wheel"})
+            driver.keys = ["up"]
+            await until(lambda: served.drive.display.takeover)
+            await driver.channel.send_json({"wish": "hand_over"})  # a takeover is not transferred
+            await driver.channel.send_json({"ping": 6})
+            await state_of(driver.channel, lambda answer: answer.get("pong") == 6)
+            assert (await state_of(driver.channel))["role"] == "driver" and len(served.server.asking) == 2
+            driver.keys = []
+            await driver.channel.send_json({"wish": "takeover"})
+            await until(lambda: not served.drive.display.takeover)
+            await driver.channel.send_json({"wish": "hand_over"})
+            heir = Driver(second, served)
+            await state_of(second, lambda state: state.get("role") == "driver")
+            telling = asyncio.create_task(heir.tell())
+            steps = served.steps
+            driver.keys = ["down"]  # is not listened to any more
+            await goes_on(served)
+            assert not served.drive.paused and np.allclose(served.car.executed[steps:], NOVICE)
+            heir.keys = ["up"]
+            await until(lambda: np.allclose(served.car.executed[-1], [0, 1]))
+            state = await state_of(driver.channel, lambda state: state.get("role") == "taken" and state["takeover"])
+            assert dict(state["indicators"])["takeover"] == "a person"
+            assert (await state_of(second, lambda state: state.get("role") == "driver"))["is_asked"]  # by the third
+            telling.cancel()
+
+    asyncio.run(hand_over())
+
+
+def test_a_next_driver_who_is_silent_pauses_the_novice(served):
+    async def hand_over():
+        async with asking(served) as (driver, second):
+            await driver.channel.send_json({"wish": "hand_over"})
+            await state_of(second, lambda state: state.get("role") == "driver")
+
+            def is_lost():
+                served.now += 0.02
+                return served.drive.paused
+
+            await until(is_lost)
+            assert np.allclose(served.car.executed, NOVICE)
+
+    asyncio.run(hand_over())
+
+
+@pytest.mark.parametrize("how", ["takes it back", "leaves", "the driver leaves"])
+def test_asking_for_the_wheel_ends(served, how):
+    async def end():
+        async with asking(served) as (driver, second):
+            if how == "takes it back":
+                await second.send_json({"wish": "wheel"})
+            else:
+                await (second if how == "leaves" else driver.channel).close()
+            await until(lambda: not served.server.asking)
+            if how == "the driver leaves":  # who has asked does not get it without a click
+                await state_of(second, lambda state: state.get("role") == "free")
+            else:
+                await driver.channel.send_json({"wish": "hand_over"})
+                assert (await state_of(driver.channel, lambda state: not state.get("is_asked", True)))["role"] == "driver"
+
+    asyncio.run(end())
 
 
 # Who is refused

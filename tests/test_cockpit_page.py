@@ -22,6 +22,7 @@ from sb3_chac.cockpit.devices.browser import MOMENT, BadMessage, Browser, Held, 
 from sb3_chac.cockpit.meter import CALM, LEAST, GuidanceMeter
 from sb3_chac.cockpit.session import Display, Novice, Totals, asks_for_help, indicators, who_drives
 from sb3_chac.cockpit.wrapper import STANDS
+from sb3_chac.common.contract import Guidance, TakeoverDisplay
 
 needs_chromium = pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium")
 # Whether there is a touch screen, sizes
@@ -176,6 +177,39 @@ def test_collisions_are_counted_once(tmp_path):
     assert [env.step(NOVICE) and drive.totals.collisions for _ in range(7)] == [0, 1, 1, 1, 1, 2, 2]
 
 
+@pytest.mark.parametrize(
+    "guidance, speed, following",
+    [
+        (Guidance(), "36 km/h", "-"),
+        (Guidance("left", 41.6, 15.0), "36/54 km/h", "left 42 m"),
+        (Guidance("2nd exit", 0.0), "36 km/h", "2nd exit now"),
+    ],
+)
+def test_what_is_said_of_the_way_ahead(guidance, speed, following):
+    said = dict(indicators(Display(speed=10.0, guidance=guidance), Totals(), 0))
+    assert (said["speed"], said["next"]) == (speed, following)
+
+
+@pytest.mark.parametrize("corridors", [None, False, True])
+def test_the_corridors_are_shown_and_hidden_where_there_are_any(tmp_path, corridors):
+    class Painted(Car, TakeoverDisplay):
+        show_corridors = corridors
+        guidance = Guidance("right", 7.0)
+
+    device, _ = device_at()
+    hold(device)
+    env, drive, car = cockpit(tmp_path, device, Painted())
+    env.reset()
+    shown = []
+    for _ in range(3):
+        shown.append(car.show_corridors)
+        drive.obey(device.handle(Wish("corridors")))
+        hold(device)
+        env.step(NOVICE)
+    other = None if corridors is None else not corridors
+    assert shown == [corridors, other, corridors] and drive.display.guidance == Guidance("right", 7.0)
+
+
 # The guidance meter
 
 
@@ -304,9 +338,12 @@ def test_nothing_overlaps_or_leaves_the_view_in_any_size(served, all_sizes):
                 "viewport": dict(zip(("width", "height"), sizes[0], strict=True)),
             }
             with opened(browser, served, **context) as page:
-                served.drive.show(novice=novice, speed=33.3, route=1.0)
+                served.server.asking = [served.server.viewers[0]]  # somebody asks for the wheel
+                guidance = Guidance("straight", 199.0, 33.3)
+                served.drive.show(novice=novice, speed=33.3, route=1.0, guidance=guidance)
                 served.drive.count(episode=12_345, **numbers)
                 shows(page, "total-step-value", "1234567")
+                shows(page, "wheel", "Somebody asks for the wheel: hand over")
                 for width, height in sizes:
                     page.set_viewport_size({"width": width, "height": height})
                     wait_until(lambda: page.evaluate("[innerWidth, innerHeight]") == [width, height], pause=0.02)  # noqa: B023
@@ -372,6 +409,21 @@ def test_two_thumbs_drive_and_a_collision_is_felt(served):
         page.evaluate(f"() => {{ const view = document.getElementById('view'); {seen} }}")
         served.drive.count(collisions=served.drive.totals.collisions + 1)
         wait_until(lambda: page.evaluate("window.vibrated === 200 && window.flashes >= 2"))  # it came and went
+
+
+@needs_chromium
+def test_the_wheel_is_handed_over_between_two_pages(served):
+    size = {"width": 800, "height": 600}
+    with chromium() as browser, opened(browser, served, viewport=size) as first:
+        second = browser.new_page(viewport=size)
+        second.goto(served.server.access.url(served.server.access.driver_token))
+        shows(second, "role", "Somebody else is at the wheel: you watch")
+        shows(first, "watching", "1 watch")
+        second.click("text=Ask for the wheel")
+        first.click("text=Somebody asks for the wheel: hand over")
+        shows(second, "role", "You are at the wheel")
+        shows(first, "wheel", "Ask for the wheel")
+        assert not second.locator("#wheel").is_visible()
 
 
 @needs_chromium

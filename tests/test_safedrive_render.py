@@ -57,6 +57,32 @@ def test_route_ahead_is_up():
     assert abs(ahead[0] - here[0]) < 1 and ahead[1] < here[1] - 10
 
 
+def test_the_faster_the_farther_it_looks_ahead():
+    env = make(blocks="SS", until=0.3)
+    reach = []
+    for speed in (0.0, 5.0, 10.0, 15.0):
+        env.ego.speed = speed
+        env.render()
+        here, ahead = env._viewer.to_picture(np.array([env._viewer._on_route(env.s + d) for d in (0.0, 10.0)]))
+        reach.append(10 * here[1] / (here[1] - ahead[1]))  # [m] to the upper edge of the picture
+    assert reach == sorted(reach) and reach[0] > 40 and reach[-1] > 80
+
+
+@pytest.mark.parametrize("scenario", range(6))
+def test_the_way_ahead_stays_in_the_picture(scenario):
+    """Through curves and junctions, and the view moves steadily."""
+    env = make(scenario, traffic_density=0, obstacle_density=0)  # a collision stops the ego at once
+    driver = env.scripted_driver("scripted-ideal")
+    shifts, done = [], False
+    while not done:
+        done = any(env.step(driver())[2:4])
+        env._viewer._look_along_route() if env._viewer else env.render()
+        ahead = env._viewer.to_picture(np.array([env._viewer._on_route(env.s + d) for d in (0.0, 10.0, 20.0, 30.0)]))
+        assert (ahead > 0).all() and (ahead[:, 0] < 800).all() and (ahead[:, 1] < 600).all()
+        shifts.append(env._viewer.shift / rendering.FINE)
+    assert np.abs(np.diff(shifts, axis=0)).max() < 30  # [px] from one step to the next
+
+
 def test_kerb_around_roundabout():
     env = make(blocks="O", until=0.35, traffic_density=0)
     frame = env.render()
@@ -91,10 +117,10 @@ OBSTACLES = {"cone": display.ORANGE, "triangle": display.RED, "parked": display.
 @pytest.mark.parametrize("kind", OBSTACLES)
 def test_obstacles_are_painted_where_they_are(kind):
     for scenario in range(20):
-        env = make(scenario, blocks="SS", obstacle_density=1, traffic_density=0)
+        env = make(scenario, until=0.2, blocks="SS", obstacle_density=1, traffic_density=0)
         frame = env.render()
         places = env._viewer.to_picture(env.scene.obstacle_positions)
-        seen = (places[:, 1] > 20) & (places[:, 1] < 580)
+        seen = ((places > 20) & (places < np.array([780, 580]))).all(axis=1)
         places = [place for o, place, s in zip(env.map.obstacles, places, seen, strict=True) if o.kind == kind and s]
         if places:
             break
@@ -106,7 +132,7 @@ def test_obstacles_are_painted_where_they_are(kind):
 def test_traffic_and_wrecks_have_their_colours():
     env = make(blocks="SS", until=0.3, traffic_density=3, obstacle_density=0)
     driver = env.scripted_driver("scripted-ideal")
-    while not (near := np.linalg.norm(env.traffic.positions - env.ego.position, axis=1) < 35).any():
+    while not (near := np.linalg.norm(env.traffic.positions - env.ego.position, axis=1) < 15).any():
         assert not any(env.step(driver())[2:4])
     car = int(env.traffic.visible[near][0])
     for colour in (display.TRAFFIC, rendering.WRECK):

@@ -62,7 +62,8 @@ class Server:
     Server of the cockpit of a drive.
 
     Who may come in, ``Access`` decides; messages that the page does not send are refused. One viewer sits at the wheel; it
-    becomes free when that one leaves, and is taken by a click then, not by itself.
+    becomes free when that one leaves, and is taken by a click then, not by itself. Others who may drive can ask for it, and
+    the driver hands it over to the one who has asked first.
 
     :param drive: with ``device`` at its wheel
     :param device: of the driver
@@ -83,6 +84,7 @@ class Server:
         self.access = Access(address, tls, clock)
         self.viewers: list[Viewer] = []
         self.driver: Viewer | None = None
+        self.asking: list[Viewer] = []  # who asks the driver for the wheel, the first one first
         self.form: Form | None = None  # that the driver is asked to fill in
         self.form_number = 0
         self._answer: asyncio.Future[Answer]
@@ -160,10 +162,13 @@ class Server:
             if telling is not None:
                 telling.cancel()
             self.viewers.remove(viewer)
+            if viewer in self.asking:
+                self.asking.remove(viewer)
             if channel.close_code == WSCloseCode.ABNORMAL_CLOSURE:
                 self.access.remark(f"lost the viewer at {viewer.remote}")
             if self.driver is viewer:
                 self.driver = None
+                self.asking.clear()
                 with self.drive.person.lock:
                     self.device.leave()
         return channel
@@ -228,6 +233,22 @@ class Server:
             with self.drive.person.lock:
                 self.device.sit_down()
 
+    def _ask_for_wheel(self, viewer: Viewer) -> None:
+        """Take the wheel if it is free, else ask the driver for it, or ask no longer."""
+        if self.driver is None:
+            self._sit_down(viewer)
+        elif viewer in self.asking:
+            self.asking.remove(viewer)
+        elif viewer.may_drive and viewer is not self.driver:
+            self.asking.append(viewer)
+
+    def _hand_over(self) -> None:
+        """Give the wheel to who has asked first, while the novice drives or in a pause: no takeover is ever transferred."""
+        with self.drive.person.lock:
+            if self.asking and not self.device.takeover:
+                self.driver = self.asking.pop(0)
+                self.device.change_driver()
+
     # What they say
 
     async def _listen(self, viewer: Viewer) -> None:
@@ -253,7 +274,9 @@ class Server:
         if isinstance(message, Wish) and message.name == "ping":
             await viewer.socket.send_json({"pong": message.number})
         elif isinstance(message, Wish) and message.name == "wheel":
-            self._sit_down(viewer)
+            self._ask_for_wheel(viewer)
+        elif viewer is self.driver and isinstance(message, Wish) and message.name == "hand_over":
+            self._hand_over()
         elif viewer is self.driver:
             self.drive.obey(self.drive.person.handle(message))
         self._news.set()
@@ -300,6 +323,9 @@ class Server:
             role = "free" if self.driver is None else "taken"
         return {
             "role": role,
+            "watching": len(self.viewers) - (self.driver is not None),
+            "asking": viewer in self.asking,
+            "is_asked": role == "driver" and bool(self.asking),
             "form": self.form_number if self.form is not None and role == "driver" else None,
             "may_take_over": drive.person.may_take_over,
             "notice": drive.notice,
@@ -312,6 +338,8 @@ class Server:
             "indicators": indicators(display, drive.totals, drive.lag, now.connected, role != "driver"),
             "confidence": display.novice.confidence,
             "risk": display.novice.risk,
+            "route": display.route,
+            "corridors": drive.corridors,
             "asks": asks_for_help(display, driver),
             "proposed": display.proposed,
             "applied": display.applied,

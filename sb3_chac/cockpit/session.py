@@ -2,13 +2,14 @@
 
 import threading
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from sb3_chac.cockpit.devices import Command
 from sb3_chac.cockpit.person import Person
+from sb3_chac.common.contract import Guidance
 
 TO_BEGIN = "Ready: P begins"
 
@@ -45,6 +46,7 @@ class Display:
     :param number: of the picture
     :param speed: [m/s], None if the environment does not tell
     :param route: share of the route that is driven, None if the environment does not tell
+    :param guidance: what the environment tells of the way ahead
     :param takeover: whether the person drove
     :param brakes: whether the vehicle was braked because nobody is at the wheel
     :param proposed: by the novice: steering (-1 left to 1 right) and pedals (-1 brake to 1 throttle)
@@ -56,6 +58,7 @@ class Display:
     number: int = 0
     speed: float | None = None
     route: float | None = None
+    guidance: Guidance = field(default_factory=Guidance)
     takeover: bool = False
     brakes: bool = False
     proposed: tuple[float, float] = (0.0, 0.0)
@@ -109,6 +112,7 @@ class Session:
         self.display = Display()  # replaced as a whole, as are the totals
         self.totals = Totals()
         self.lag = 0  # gradient steps that the learner owes
+        self.corridors: bool | None = None  # whether the picture shows them, None if it cannot
         self.busy = ""  # why the car waits though nobody paused
         self.message = TO_BEGIN
         self.paused = True
@@ -167,6 +171,8 @@ class Session:
                 self.skip()
             case Command.QUIT:
                 self.quit()
+            case Command.CORRIDORS if self.corridors is not None:
+                self.corridors = not self.corridors
 
     @property
     def notice(self) -> str:
@@ -245,7 +251,7 @@ def lost_message(device: str) -> str:
     :return: what to tell a person whose device is gone
     """
     if device == "browser":
-        return "Nobody is at the wheel: open the page, or click into it; then P goes on"
+        return "Nobody is at the wheel: open the page, or click into it; then Begin or P goes on"
     if device == "keyboard":
         return "The window has lost the keyboard: click into it, then P goes on"
     return f"No {device}: plug it in, or press K for the keyboard; then P goes on"
@@ -295,9 +301,10 @@ def indicators(
     minutes, seconds = divmod(int(totals.seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return [
-        ("speed", "-" if display.speed is None else f"{3.6 * display.speed:.0f} km/h"),
+        ("speed", _speed(display.speed, display.guidance.speed_limit)),
         ("takeover", FOR_OTHERS if driver == "person" and watches else TAKEOVER[driver]),
         ("route", "-" if display.route is None else f"{display.route:.0%}"),
+        ("next", str(display.guidance)),
         ("total step", f"{totals.total_steps}"),
         ("total time", f"{hours}:{minutes:02}:{seconds:02}"),
         ("takeover rate", f"{totals.takeover_rate:.1%}"),
@@ -309,3 +316,14 @@ def indicators(
         ("episode", f"{totals.episode}"),
         ("updates behind", f"{lag}" if lag else "none"),
     ]
+
+
+def _speed(speed: float | None, limit: float | None) -> str:
+    """
+    Word the speed and its limit.
+
+    :param speed: [m/s], likewise ``limit``; None if it is not known
+    """
+    if speed is None:
+        return "-"
+    return f"{3.6 * speed:.0f} km/h" if limit is None else f"{3.6 * speed:.0f}/{3.6 * limit:.0f} km/h"

@@ -19,12 +19,14 @@ SIZE = 1120, 720
 FRAME_SECONDS = 0.033
 DRAWING_SECONDS = 0.012  # that drawing may take: not begun right before a step, for events wait meanwhile
 DIM, LINE, BAR = (140, 145, 155), (70, 76, 86), (42, 47, 56)
+BARS = {"route": (138, 180, 255), "confidence": EGO, "risk": ORANGE}
 COLOURS = {"person": HUMAN, "brake": RED, "novice": EGO}  # of who drives
 
 COMMANDS = {
     pygame.K_p: Command.PAUSE,
     pygame.K_n: Command.SKIP,
     pygame.K_q: Command.QUIT,
+    pygame.K_c: Command.CORRIDORS,
     pygame.K_h: Command.HELP,
     pygame.K_k: Command.KEYBOARD,
 }
@@ -40,6 +42,7 @@ HELP = (
     ("P", "pause, go on"),
     ("N", "next episode: skip this one"),
     ("Q", "quit, with a checkpoint to resume from"),
+    ("C", "what the policy sees: how far ways ahead are free"),
     ("H", "this help"),
 )
 
@@ -166,14 +169,14 @@ class Window:
                 colour = ORANGE
             self._text(name, (SIDE.left + 24, y), self.font, DIM)
             self._text(value, (SIDE.right - 16, y), self.font, colour, "topright")
-            y += 34
-            share = {"confidence": display.novice.confidence, "risk": display.novice.risk}.get(name)
+            y += 33
+            share = {"confidence": display.novice.confidence, "risk": display.novice.risk, "route": display.route}.get(name)
             if share is not None:
                 bar = pygame.Rect(SIDE.left + 24, y - 8, SIDE.width - 40, 10)
                 pygame.draw.rect(self.screen, BAR, bar, border_radius=3)
                 filled = bar.copy()
                 filled.width = round(bar.width * share)
-                pygame.draw.rect(self.screen, EGO if name == "confidence" else ORANGE, filled, border_radius=3)
+                pygame.draw.rect(self.screen, BARS[name], filled, border_radius=3)
                 y += 14
         device = self.drive.person.device
         self._text(f"device: {device.name}", (SIDE.left + 24, SIDE.bottom - 56), self.small, DIM)

@@ -39,6 +39,7 @@ class Cockpit(gym.Wrapper):
         self._touched = False  # whether the vehicle touched something in the last step
         if isinstance(self.unwrapped, TakeoverDisplay):
             self.unwrapped.panel = False  # each number is shown once, beside the picture
+            drive.corridors = self.unwrapped.show_corridors
         self._rng = np.random.default_rng()
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
@@ -116,6 +117,8 @@ class Cockpit(gym.Wrapper):
     def _show(self, info: dict[str, Any], takeover: bool, **changes: Any) -> None:
         if isinstance(self.unwrapped, TakeoverDisplay):
             self.unwrapped.hud = {"takeover": takeover}  # the rest is told beside the picture
+            self.unwrapped.show_corridors = self.drive.corridors
+            changes["guidance"] = self.unwrapped.guidance
         picture = self.env.env.render()
         if isinstance(picture, list):
             picture = picture[-1]

@@ -169,14 +169,34 @@ class TakeoverWrapper(gym.Wrapper):
         return self.action_space
 
 
+class Guidance(NamedTuple):
+    """What an environment tells a person about the way ahead; None and "" for what it does not know."""
+
+    turn: str = ""  # at the next junction, "goal" if there is none before it
+    distance: float | None = None  # [m] to it, 0 inside of a junction
+    speed_limit: float | None = None  # [m/s]
+
+    def __str__(self) -> str:
+        if self.distance is None:
+            return "-"
+        return f"{self.turn} now" if self.distance == 0 else f"{self.turn} {self.distance:.0f} m"
+
+
 class TakeoverDisplay:
     """
     Base of environments whose pictures show what wrappers want to have shown (``hud``: name -> value), in a box of numbers
-    unless ``panel`` is False: then whoever shows the picture shows them beside it.
+    unless ``panel`` is False: then whoever shows the picture shows them beside it, with the ``guidance``. Those that can paint
+    the corridors of their observation do so if ``show_corridors`` is True, which is None for those that cannot.
     """
 
     hud: dict[str, Any]
     panel: bool = True
+    show_corridors: bool | None = None
+
+    @property
+    def guidance(self) -> Guidance:
+        """What a navigation system would tell."""
+        return Guidance()
 
 
 class _ActionWrapperAboveTakeover(type):

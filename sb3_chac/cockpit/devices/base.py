@@ -28,6 +28,7 @@ class Command(StrEnum):
     PAUSE = "pause"  # or go on
     SKIP = "skip"  # to the next episode
     QUIT = "quit"
+    CORRIDORS = "corridors"  # to be painted, or not
     HELP = "help"
     KEYBOARD = "keyboard"  # to drive with from now on
 

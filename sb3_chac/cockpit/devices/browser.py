@@ -8,7 +8,8 @@ from typing import Any, Literal, NamedTuple
 from sb3_chac.cockpit.devices import GAMEPAD, Clock, Command, DriverInput, Pedal, Ramps
 
 KEYS = {"left", "right", "up", "down"}
-COMMANDS = {command.value: command for command in (Command.PAUSE, Command.SKIP, Command.QUIT)}
+WISHES = {"pause", "skip", "quit", "corridors", "takeover", "wheel", "hand_over", "away"}
+COMMANDS = {command.value: command for command in (Command.PAUSE, Command.SKIP, Command.QUIT, Command.CORRIDORS)}
 STALE = 0.3  # [s] without a message; the page sends every 50 ms
 TRIGGER = Pedal(0, 0.0, 1.0)  # as browsers report them
 MOMENT = 1.0  # [s] from the last touch until a takeover that began with one is handed back
@@ -32,7 +33,7 @@ class Held(NamedTuple):
 class Wish(NamedTuple):
     """Anything else that the page asks for; ``number`` is that of a ping."""
 
-    name: Literal["pause", "skip", "quit", "takeover", "wheel", "away", "ping"]
+    name: Literal["pause", "skip", "quit", "corridors", "takeover", "wheel", "hand_over", "away", "ping"]
     number: int = 0
 
 
@@ -61,8 +62,8 @@ def parse(text: str) -> Held | Wish:
             if len(keys) > len(KEYS) or not all(isinstance(key, str) and key in KEYS for key in keys):
                 raise BadMessage("unknown keys")
             return Held(frozenset(keys), _axes(gamepad, 3, "a gamepad"), _axes(more.get("touch"), 2, "a touch"))
-        case {"wish": ("pause" | "skip" | "quit" | "takeover" | "wheel" | "away") as name} if len(data) == 1:
-            return Wish(name)
+        case {"wish": str(name)} if len(data) == 1 and name in WISHES:
+            return Wish(name)  # type: ignore[arg-type]
         case {"ping": int(number)} if len(data) == 1 and not isinstance(number, bool) and 0 <= number < 2**53:
             return Wish("ping", number)
     raise BadMessage("unknown message")
@@ -100,6 +101,12 @@ class Browser:
     def sit_down(self) -> None:
         """Somebody takes the wheel."""
         self.taken = True
+
+    def change_driver(self) -> None:
+        """The wheel goes from one person to the next, who has ``STALE`` to be heard. To be called while nobody takes over."""
+        self.leave()
+        self.sit_down()
+        self.heard_at = self.clock()
 
     def leave(self) -> None:
         """Note that nobody is there any more. A takeover is not over by that."""

@@ -11,7 +11,8 @@ const KEYS = {
   ArrowLeft: "left", KeyA: "left", ArrowRight: "right", KeyD: "right",
   ArrowUp: "up", KeyW: "up", ArrowDown: "down", KeyS: "down",
 };
-const WISHES = { Space: "takeover", KeyP: "pause", KeyN: "skip", KeyQ: "quit" };
+const WISHES = { Space: "takeover", KeyP: "pause", KeyN: "skip", KeyQ: "quit", KeyC: "corridors" };
+const METERS = ["route", "confidence", "risk"]; // indicators with a bar
 const BUTTONS = { 0: "takeover", 9: "pause", 8: "skip" }; // of a gamepad with the standard mapping
 const ROLES = {
   driver: "You are at the wheel",
@@ -32,6 +33,7 @@ let pings = 0;
 let toldAt = 0;
 let collisions = null;
 let asks = false; // whether the novice asks for help
+let isAsked = false; // whether somebody asks the driver for the wheel
 const socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/ws${location.search}`);
 socket.binaryType = "blob";
 
@@ -207,7 +209,8 @@ for (const button of document.querySelectorAll("[data-wish]")) {
   onClick(button, wish === "quit" ? quitTwice : () => ask(wish));
 }
 for (const button of document.querySelectorAll("[data-opens]")) onClick(button, () => open(button.dataset.opens));
-onClick(byId("wheel"), () => send({ wish: "wheel" }));
+onClick(byId("wheel"), () => send({ wish: role === "driver" ? "hand_over" : "wheel" }));
+byId("corridors").addEventListener("change", () => ask("corridors"));
 setInterval(tellHeld, HEARTBEAT);
 setInterval(() => {
   sentAt.set(++pings, performance.now());
@@ -250,6 +253,8 @@ function makePad(name, value) {
     tellSoon();
   });
   for (const kind of ["pointerup", "pointercancel", "lostpointercapture"]) pad.addEventListener(kind, end);
+  // Else a Chromium, in wait of a gesture, lets messages of the server lie for 100 ms
+  pad.addEventListener("touchstart", (event) => event.preventDefault(), { passive: false });
   pad.addEventListener("contextmenu", (event) => event.preventDefault());
 }
 
@@ -310,7 +315,7 @@ function makeCell(name) {
   const value = document.createElement("dd");
   value.id = `${name.replaceAll(" ", "-")}-value`;
   cell.append(term, value);
-  if (name === "confidence" || name === "risk") {
+  if (METERS.includes(name)) {
     const meter = document.createElement("dd");
     meter.className = "meter";
     meter.id = `${name}-bar`;
@@ -336,6 +341,26 @@ function showQuery(isAsking) {
   }
   asks = isAsking;
   document.body.classList.toggle("asks", asks);
+}
+
+/** The button with which the wheel is taken, asked for and handed over. */
+function showWheel(state) {
+  const wheel = byId("wheel");
+  const handOver = state.wants ? "Somebody asks for the wheel: hand back first" : "Somebody asks for the wheel: hand over";
+  const texts = {
+    free: "Take the wheel",
+    taken: state.asking ? "You have asked for the wheel: ask no longer" : "Ask for the wheel",
+    driver: state.is_asked ? handOver : "",
+  };
+  setText(wheel, texts[role] ?? "");
+  wheel.hidden = !wheel.textContent;
+  wheel.disabled = role === "driver" && state.wants;
+  if (state.is_asked && !isAsked) {
+    vibrate(120);
+    if (options.sound) beep(440);
+  }
+  isAsked = state.is_asked;
+  setText(byId("watching"), state.watching ? `${state.watching} watch` : "");
 }
 
 function showCollisions(number) {
@@ -438,20 +463,23 @@ function show(state) {
   showForm(state.form);
   document.body.dataset.driver = state.driver;
   const told = state.driver === "person" && role === "driver" ? "You drive" : DRIVERS[state.driver];
-  setText(byId("told"), state.asks ? "The novice asks for help" : told);
+  const wheelToo = state.is_asked ? `${told}. Somebody asks for the wheel` : told;
+  setText(byId("told"), state.asks ? "The novice asks for help" : wheelToo);
   setText(byId("role"), ROLES[role]);
-  byId("wheel").hidden = role !== "free";
+  showWheel(state);
   byId("notice").hidden = !state.notice;
   setText(byId("notice"), state.notice);
   byId("notice").classList.toggle("waits", state.waits);
   const list = byId("indicators");
   if (list.childElementCount !== state.indicators.length) list.replaceChildren(...state.indicators.map(([name]) => makeCell(name)));
   for (const [name, value] of state.indicators) setText(byId(`${name.replaceAll(" ", "-")}-value`), value);
-  for (const name of ["confidence", "risk"]) {
+  for (const name of METERS) {
     byId(`${name}-bar`).hidden = state[name] === null;
     byId(`${name}-bar`).firstElementChild.style.width = `${100 * (state[name] ?? 0)}%`;
   }
   showQuery(state.asks);
+  byId("corridors").disabled = role !== "driver" || state.corridors === null;
+  byId("corridors").checked = state.corridors === true;
   for (const name of Object.keys(bars)) bars[name].forEach((set, i) => set(state[name][i]));
   for (const button of document.querySelectorAll("[data-wish]")) button.disabled = role !== "driver";
   const mayDrive = role === "driver" && state.may_take_over;
@@ -488,6 +516,7 @@ socket.addEventListener("close", ({ code, reason }) => {
   showForm(null);
   role = "";
   document.body.dataset.driver = "unknown";
+  byId("wheel").hidden = true;
   byId("notice").hidden = false;
   const lost = `Not connected${reason ? `: ${reason}` : ""}. Reload the page to connect again`;
   byId("notice").textContent = code === 1001 && reason ? reason : lost; // it went away in good order

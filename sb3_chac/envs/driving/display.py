@@ -10,8 +10,10 @@ Colour = tuple[int, int, int]
 Area = tuple[Colour, np.ndarray]  # of the map, corners [m] of shape (n, 2)
 
 SIZE = 800, 600  # [px]
-SCALE = 6.0  # [px/m]
-EGO_AT = 0.5, 0.72  # where in the picture the ego is, of its width and height
+SCALES = 10.0, 6.0  # [px/m] when the ego stands, and at the speed FAST
+EGO_AT = 0.74, 0.87  # where in the picture the ego is, of its height, likewise
+ASIDE = 0.3  # of the picture's width, by which the ego is beside its middle at most
+FAST = 15.0  # [m/s]
 FINE = 2  # painted that many times larger and then shrunk, for smooth edges
 STEPS_PER_SECOND = 10
 FLASH_STEPS = 4  # that a collision shows
@@ -37,8 +39,6 @@ class Display:
         self.env, self.pygame = env, pygame
         size = SIZE[0] * FINE, SIZE[1] * FINE
         self.canvas = WorldSurface(size, 0, pygame.Surface(size, 0, 32))
-        self.canvas.scaling, self.canvas.centering_position = SCALE * FINE, list(EGO_AT)
-        self.canvas.move_display_window_to(np.zeros(2))  # the ego is the origin
         self.picture = pygame.Surface(SIZE, 0, 32)
         self.font, self.large_font = pygame.font.Font(None, 21), pygame.font.Font(None, 34)
         self.window: Any = None
@@ -105,18 +105,29 @@ class Display:
 
     # What is painted: the methods below work on the canvas, which is larger than the picture
 
-    def _look(self, position: np.ndarray, heading: float) -> None:
+    def _look(self, position: np.ndarray, heading: float, speed: float, way: np.ndarray | None = None) -> None:
         """
-        Set the view.
+        Set the view. The faster the ego is, the farther it looks ahead; the way ahead is in the middle of the picture.
 
         :param position: [m] of the ego on the map, y downwards, shape (2,)
         :param heading: [rad] that is to be upwards, clockwise from the x axis
+        :param speed: [m/s] of the ego
+        :param way: [m] points of its way from itself on, one every metre, as far as it is known, shape (n, 2)
         """
+        share = min(abs(speed) / FAST, 1.0)
+        self.scale, down = (slow + share * (fast - slow) for slow, fast in (SCALES, EGO_AT))
         self.angle = -np.pi / 2 - heading
         cos, sin = np.cos(self.angle), np.sin(self.angle)
         self.rotation = np.array([[cos, -sin], [sin, cos]])
         self.centre = np.array(position, dtype=float)
-        self.shift = np.array(EGO_AT) * self.canvas.get_size()
+        across = 0.5
+        if way is not None:
+            ahead = ((way[: int(down * SIZE[1] / self.scale)] - self.centre) @ self.rotation.T)[:, 0]
+            across -= float(np.clip((ahead.min() + ahead.max()) / 2 * self.scale / SIZE[0], -ASIDE, ASIDE))
+        self.shift = np.array([across, down]) * self.canvas.get_size()
+        # For highway-env's graphics, the ego is the origin
+        self.canvas.scaling, self.canvas.centering_position = self.scale * FINE, [across, down]
+        self.canvas.move_display_window_to(np.zeros(2))
 
     @property
     def _ego_colour(self) -> Colour:
@@ -132,7 +143,7 @@ class Display:
         return self._to_canvas(points) / FINE
 
     def _to_canvas(self, points: np.ndarray) -> np.ndarray:
-        return (points - self.centre) @ self.rotation.T * (SCALE * FINE) + self.shift
+        return (points - self.centre) @ self.rotation.T * (self.scale * FINE) + self.shift
 
     def _polygon(self, colour: Colour, points: np.ndarray) -> None:
         self.pygame.draw.polygon(self.canvas, colour, self._to_canvas(points).tolist())
@@ -152,7 +163,7 @@ class Display:
             self._middles = np.array([(points.max(axis=0) + points.min(axis=0)) / 2 for points in corners])
             self._sizes = np.array([np.linalg.norm(np.ptp(points, axis=0)) / 2 for points in corners])
         self.canvas.fill(GRASS)
-        middles, reach = self._to_canvas(self._middles), self._sizes * SCALE * FINE
+        middles, reach = self._to_canvas(self._middles), self._sizes * self.scale * FINE
         width, height = self.canvas.get_size()
         seen = (np.abs(middles[:, 0] - width / 2) < width / 2 + reach) & (
             np.abs(middles[:, 1] - height / 2) < height / 2 + reach
@@ -242,6 +253,7 @@ class Display:
         rows = {
             "speed": f"{3.6 * info['speed']:.0f} km/h",
             "route": f"{info['route_completion']:.0%}",
+            "next": str(self.env.guidance),
             "cost": f"{info['episode_cost']:g}",
             "time": f"{self.env.steps / STEPS_PER_SECOND:.1f} s",
         }

@@ -65,9 +65,7 @@ class ScriptedDriver(PlanningDriver):
         self.targets, self.lane_width = self.route.targets, self.route.lane_width
         self.position, self.heading = self.env.position, float(ego.heading_theta)
         self.speed = max(self.env.forward_speed, 0.0)
-        k = min(max(int(navigation._target_checkpoints_index[0]), 0), len(self.route.starts) - 2)
-        low, high = self.route.starts[k] - 10.0, self.route.starts[k + 1] + 20.0
-        self.s, self.lateral, self.index = self.route.locate(self.position, low, high)
+        self.s, self.lateral, self.index = self.route.locate(self.position, *self.route.now(navigation))
         self.error = float(wrap_angle(self.heading - self.route.heading[self.index]))  # [rad], positive to the left
         self.length, self.width = float(ego.LENGTH), float(ego.WIDTH)
         self.max_steering = float(np.radians(ego.max_steering))

@@ -7,9 +7,11 @@ from gymnasium import spaces
 
 from sb3_chac.common.arguments import checked
 from sb3_chac.common.checks import check_driving_action, check_integer, check_range
+from sb3_chac.common.contract import Guidance
 from sb3_chac.envs.driving.corridors import N_CORRIDORS, N_VIEW, CorridorView
 from sb3_chac.envs.driving.display import Display
 from sb3_chac.envs.driving.env import CONTACT_MEMORY, DrivingEnv
+from sb3_chac.envs.driving.guidance import guide
 from sb3_chac.envs.metadrive.drivers import DRIVERS
 from sb3_chac.envs.metadrive.observation import (
     LIDAR_REACH,
@@ -20,6 +22,7 @@ from sb3_chac.envs.metadrive.observation import (
     STRIPS,
     route_ahead,
 )
+from sb3_chac.envs.metadrive.route import Route
 from sb3_chac.envs.metadrive.simulator import check_installed, is_headless, make_simulator, prepare, release
 
 MAX_SCENARIO = 1_000_000
@@ -319,6 +322,17 @@ class MetaDriveSafetyEnv(DrivingEnv):
         return DRIVERS[name](self)
 
     # Pictures
+
+    @property
+    def guidance(self) -> Guidance:
+        """Next junction, its distance, and the speed limit, which is the vehicle's top speed."""
+        navigation = self.ego.navigation
+        if self._route is None or not self._route.is_of(navigation):
+            self._route = Route(navigation)
+        s, _, _ = self._route.locate(self.position, *self._route.now(navigation))
+        return guide(self._route.junctions, s, float(self._route.starts[-1]), float(self.ego.max_speed_km_h) / 3.6)
+
+    _route: Route | None = None
 
     def _make_viewer(self) -> Display:
         from sb3_chac.envs.metadrive.render import Viewer

@@ -39,7 +39,7 @@ class Viewer(Display):
 
     def _paint(self) -> None:
         env = self.env
-        self._look(env.position * DOWNWARDS, -env.ego.heading_theta)
+        self._look(env.position * DOWNWARDS, -env.ego.heading_theta, env.last_info["speed"])
         self._paint_map((env.simulator.current_map, env.scenario), self._areas)
         self._paint_destination()
         signs = []

@@ -1,11 +1,15 @@
 """Paths along MetaDrive's lanes: the ego's route, and where vehicles of the traffic go."""
 
+import re
 from typing import Any
 
 import numpy as np
 
 from sb3_chac.envs.driving.geometry import SPACING
+from sb3_chac.envs.driving.guidance import Junction, way_through
 
+BLOCK = re.compile(r"-?(\d+)([A-Za-z])")  # number and kind, at the beginning of a checkpoint's name
+JUNCTIONS = "XTO"  # intersection, T-intersection, roundabout
 RUN_OUT = 60.0  # [m] by which paths go straight on beyond their ends
 
 
@@ -96,6 +100,30 @@ class Route(Path):
         self.left, self.right = -self.lane_width / 2, (lanes - 0.5) * self.lane_width  # [m] its edges
         self.targets = self.lane_width * np.arange(min(len(road) for road in roads))  # [m] middles of the lanes all along it
         self.targets = np.clip(self.targets, self.left + 2.05, self.targets[-1] + self.lane_width / 2 - 2.05)
+
+    @property
+    def junctions(self) -> list[Junction]:
+        """Junctions on the route."""
+        spans: dict[str, tuple[float, float]] = {}  # of the blocks [m]
+        for name, start, end in zip(self.checkpoints[1:], self.starts[:-1], self.starts[1:], strict=True):
+            block = BLOCK.match(name)
+            if block and block[2] in JUNCTIONS:
+                spans[block[0]] = spans.get(block[0], (start, end))[0], end
+        headings = {place: self.heading[self.index(place)] for span in spans.values() for place in span}
+        return [
+            Junction(float(start), float(end), way_through(float(headings[start] - headings[end])), name.endswith("O"))
+            for name, (start, end) in spans.items()
+        ]
+
+    def now(self, navigation: Any) -> tuple[float, float]:
+        """
+        Tell where on the route the ego is to be looked for.
+
+        :param navigation: MetaDrive's, of this route
+        :return: [m] from where to where along it
+        """
+        k = min(max(int(navigation._target_checkpoints_index[0]), 0), len(self.starts) - 2)
+        return self.starts[k] - 10.0, self.starts[k + 1] + 20.0
 
     def is_of(self, navigation: Any) -> bool:
         """Tell whether this is the route of a navigation as it is now."""

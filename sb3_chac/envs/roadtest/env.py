@@ -8,6 +8,7 @@ from gymnasium import spaces
 
 from sb3_chac.common.checks import check_integer, check_range
 from sb3_chac.envs.driving.geometry import SPACING, boxes_overlap
+from sb3_chac.envs.driving.guidance import WAYS as COMMANDS
 from sb3_chac.envs.driving.layout import placed
 from sb3_chac.envs.driving.planner import Others
 from sb3_chac.envs.safedrive.driver import IMPERFECTIONS, ScriptedDriver
@@ -18,7 +19,6 @@ from sb3_chac.envs.safedrive.scene import Scene
 from sb3_chac.envs.safedrive.vehicle import MAX_SPEED
 
 ROUTES = {1: "SXCTSO", 2: "CTSXCO"}  # blocks of the routes, which are the scenarios
-COMMANDS = ("left", "straight", "right")
 COMMAND_AHEAD = 40.0  # [m] before a junction from where on the command tells the way through it
 CHECKPOINTS = np.arange(2.0, 61.0, 2.0)  # [m] ahead on the route, 30
 N_CHECKPOINTS = len(CHECKPOINTS)
@@ -181,12 +181,8 @@ class RoadTestEnv(SafeDriveEnv):
     @property
     def command(self) -> str:
         """Command for the next junction: "left", "straight" or "right"."""
-        s = 0.0
-        for block in self.map.blocks:
-            start, s = s, s + length(block.route)
-            if block.kind in "OTX" and start - COMMAND_AHEAD <= self.s < s:
-                return COMMANDS[int(np.sign(round(block.exit_arm, 3))) + 1]
-        return "straight"
+        ahead = (junction.way for junction in self.map.junctions if junction.start - COMMAND_AHEAD <= self.s < junction.end)
+        return next(ahead, "straight")
 
     def scan(self) -> tuple[np.ndarray, np.ndarray]:
         """

@@ -10,11 +10,13 @@ from highway_env.road.road import Road
 
 from sb3_chac.common.arguments import checked
 from sb3_chac.common.checks import check_driving_action, check_integer, check_range
+from sb3_chac.common.contract import Guidance
 from sb3_chac.envs.driving.compiled import compiled
 from sb3_chac.envs.driving.corridors import N_VIEW, CorridorView
 from sb3_chac.envs.driving.display import STEPS_PER_SECOND, Display
 from sb3_chac.envs.driving.env import DrivingEnv
 from sb3_chac.envs.driving.geometry import boxes_overlap
+from sb3_chac.envs.driving.guidance import guide
 from sb3_chac.envs.safedrive.driver import IMPERFECTIONS, ScriptedDriver
 from sb3_chac.envs.safedrive.geometry import Pose
 from sb3_chac.envs.safedrive.layout import layout
@@ -151,7 +153,7 @@ class SafeDriveEnv(DrivingEnv):
         self.arrival_reward, self.out_of_road_penalty = arrival_reward, out_of_road_penalty
         if show_corridors and not corridors:
             raise ValueError("show_corridors: there are none with corridors=False, leave out one of the two.")
-        self.show_lidar, self.show_corridors = show_lidar, show_corridors
+        self.show_lidar, self.show_corridors = show_lidar, show_corridors if corridors else None
 
         self.action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
         self.lidar = Lidar()
@@ -354,6 +356,11 @@ class SafeDriveEnv(DrivingEnv):
         return self.ego.position.copy()
 
     # Pictures
+
+    @property
+    def guidance(self) -> Guidance:
+        """Next junction, its distance, and the speed limit, which is the vehicle's top speed."""
+        return guide(self.map.junctions, self.s, self.map.finish, MAX_SPEED)
 
     def _make_viewer(self) -> Display:
         from sb3_chac.envs.safedrive.render import Viewer

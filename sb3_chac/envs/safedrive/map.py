@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sb3_chac.envs.driving.geometry import wrap_angle
+from sb3_chac.envs.driving.guidance import Junction, way_through
 from sb3_chac.envs.safedrive.geometry import Pose, Segment, chain, sample, turn
 
 LANE_WIDTH = 4.0  # [m]
@@ -189,6 +190,12 @@ class Map:
         self.length = length(segments) - RUN_OUT
         self.finish = self.length - ARRIVES_BEFORE_END  # [m] along the route
         self.route = sample(self.start, segments)
+        joints = [0.0, *np.cumsum([length(block.route) for block in self.blocks]).tolist()]
+        self.junctions = [  # of the route
+            Junction(start, end, way_through(block.exit_arm), block.kind == "O")
+            for block, start, end in zip(self.blocks, joints[:-1], joints[1:], strict=True)
+            if block.kind in "OTX"
+        ]
         self.paths = [Path("route", self.start, segments, shared=(0.0, np.inf)), *self._other_paths()]
         self.obstacles = self._place_obstacles(rng, obstacle_density)
 

@@ -27,7 +27,8 @@ if TYPE_CHECKING:
     from sb3_chac.envs.safedrive.env import SafeDriveEnv
 
 UP = -5.0, 15.0  # [m] before the ego on the route, places of which the second is above the first
-ARROWS, ARROW_SPACING = 7, 10.0  # number, [m] on the route
+WAY = 100.0  # [m] of the route ahead, farther than any picture shows
+ARROWS, ARROW_SPACING = 9, 10.0  # number, [m] on the route
 
 COLOURS = {
     "grass": GRASS, "trees": (104, 134, 88), "kerb": (214, 212, 204), "asphalt": ASPHALT, "route": ROUTE, "line": LINE,
@@ -72,7 +73,9 @@ class Viewer(Display):
     def _look_along_route(self) -> None:
         """The direction of the route upwards: steadier than the ego's own heading."""
         x, y = self._on_route(self.env.s + UP[1]) - self._on_route(self.env.s + UP[0])
-        self._look(self.env.ego.position, float(np.arctan2(y, x)))
+        env = self.env
+        way = env.map.route[self._index(env.s) : self._index(env.s + WAY) : int(1 / SPACING), :2]
+        self._look(env.ego.position, float(np.arctan2(y, x)), env.ego.speed, np.vstack([env.ego.position, way]))
 
     def _on_route(self, s: float) -> np.ndarray:
         """
