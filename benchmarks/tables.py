@@ -28,6 +28,7 @@ HERE = Path(__file__).parent
 ROOT, RESULTS = HERE.parent, HERE / "results"
 README, PICTURE = ROOT / "README.md", ROOT / "docs" / "headline.png"
 WITH, WITHOUT = RESULTS / "guidance", RESULTS / "guidance-without-corridors"
+LIMITED = RESULTS / "guidance-max-deviation"
 METADRIVE = RESULTS / "guidance-metadrive-without-corridors"
 MARK = re.compile(r"(<!-- table (\S+): made by benchmarks/tables\.py -->\n)(?:(?!<!-- ).)*(<!-- end of table -->)", re.DOTALL)
 METHODS = {"sac": "SAC", "dsac": "DSAC", "pvp": "PVP", "dpvp": "D-PVP", "chac": "C-HAC"}
@@ -345,6 +346,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "guidance": partial(guidance, WITH),
     "guidance-seeds": seeds,
     "second-stage": second_stage,
+    "second-stage-limited": partial(second_stage, LIMITED),
     "guidance-without-corridors": partial(guidance, WITHOUT),
     "ablations": ablations,
     "metadrive-without-corridors": partial(guidance, METADRIVE, paper=True),

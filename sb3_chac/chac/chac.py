@@ -84,8 +84,8 @@ class CHAC(DPVP):
     :param prefit_steps: gradient steps of Z_c, on both stores, at the switch
     :param bootstrap: "executed": Z_c evaluates what is executed in stage 2 (shared control); "self": pi_r
     :param stage2_human_share: share of the human's transitions in the batches of stage 2
-    :param stage2_guided_share: least share of the novice's transitions of stage 1: those before a takeover are what Z_c
-        knows danger from, and would be the rarer the longer stage 2 goes on
+    :param stage2_guided_share: least share of the novice's transitions of stage 1. Those before a takeover are what Z_c knows
+        danger from, and are the rarer the longer stage 2 goes on
     :param anchor_coef: weight of the squared distance between the actions of pi_r and pi_g, both in [-1, 1], in pi_r's loss;
         in units of what Z_c learns
     :param max_deviation: of pi_r's action from pi_g's in each dimension, both in [-1, 1], when it acts; 2: no limit
@@ -104,7 +104,6 @@ class CHAC(DPVP):
         "prefit_steps": 0,
         "bootstrap": "self",
         "stage2_human_share": 0.0,
-        "stage2_guided_share": 0.0,
         "anchor_coef": 0.0,
         "normalize_rewards": False,
         "cost_coef": 0.0,
@@ -167,7 +166,7 @@ class CHAC(DPVP):
         prefit_steps: int = 8000,
         bootstrap: str = "executed",
         stage2_human_share: float = 0.25,
-        stage2_guided_share: float = 0.5,
+        stage2_guided_share: float = 0.0,
         anchor_coef: float = 15.0,
         max_deviation: float = 2.0,
         normalize_rewards: bool = True,
