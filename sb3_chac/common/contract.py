@@ -170,7 +170,7 @@ class TakeoverWrapper(gym.Wrapper):
 
 
 class Guidance(NamedTuple):
-    """What an environment tells a person about the way ahead; None and "" for what it does not know."""
+    """Directions of an environment for a person: the way ahead; None and "" stand for what is not known."""
 
     turn: str = ""  # at the next junction, "goal" if there is none before it
     distance: float | None = None  # [m] to it, 0 inside of a junction
@@ -195,7 +195,7 @@ class TakeoverDisplay:
 
     @property
     def guidance(self) -> Guidance:
-        """What a navigation system would tell."""
+        """Tell the way ahead, as a navigation system would."""
         return Guidance()
 
 

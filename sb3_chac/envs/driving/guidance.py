@@ -1,4 +1,4 @@
-"""What a navigation system would tell: the next junction on the route, the way through it, and how far it is."""
+"""Guidance as of a navigation system: the next junction on the route, the way through it, and how far it is."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
