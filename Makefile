@@ -66,6 +66,7 @@ bench: $(INSTALLED)
 	for part in "run --jobs 2" report; do $(BIN)/python benchmarks/learning.py $$part || exit; done
 	for part in "run --jobs 2" report; do $(BIN)/python benchmarks/lagrangian.py $$part || exit; done
 	for part in "run --jobs 2" report agents cost; do $(BIN)/python benchmarks/guidance.py $$part || exit; done
+	for part in "run --jobs 2" report; do $(BIN)/python benchmarks/beyond.py $$part || exit; done
 	$(BIN)/python benchmarks/foresight.py benchmarks/models/SafeDrive-v0/chac-stage-1-*.zip
 	for part in "run --jobs 2" report; do $(BIN)/python benchmarks/suite.py $$part || exit; done
 	$(BIN)/python benchmarks/film.py
