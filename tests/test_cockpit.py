@@ -4,6 +4,8 @@ import os
 import re
 import threading
 import time
+from ctypes import sizeof
+from dataclasses import replace
 
 os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
 
@@ -19,7 +21,9 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_chac import CHAC, DPVP, PVP, HGDagger
 from sb3_chac.__main__ import main
+from sb3_chac.cockpit import window as window_module
 from sb3_chac.cockpit.devices import (
+    G29,
     GAMEPAD,
     WHEEL,
     Calibration,
@@ -27,14 +31,17 @@ from sb3_chac.cockpit.devices import (
     DeviceError,
     Joystick,
     Keyboard,
+    Spring,
+    Steering,
     load_config,
     save_config,
 )
 from sb3_chac.cockpit.devices.emulator import DeviceEmulator
+from sb3_chac.cockpit.devices.feedback import MOST_RAW, SPRING, Condition, sdl
 from sb3_chac.cockpit.driven import driven
 from sb3_chac.cockpit.person import NotDrivable, Person, check_drivable
 from sb3_chac.cockpit.recording import FOLDER
-from sb3_chac.cockpit.session import SessionEnded
+from sb3_chac.cockpit.session import Session, SessionEnded
 from sb3_chac.cockpit.window import Window
 from sb3_chac.common.checkpoint_files import sound_checkpoint
 from sb3_chac.common.demonstrations import load_demonstrations
@@ -53,11 +60,11 @@ def keyboard():
     return clock, device, DeviceEmulator(device.handle)
 
 
-def wheel(config=WHEEL):
+def wheel(config=WHEEL, spring=None):
     clock = Clock()
     emulator = DeviceEmulator(lambda event: answers.append(device.handle(event)))
     answers: list = []
-    device = Joystick(config, clock, emulator.open_joystick)
+    device = Joystick(config, clock, emulator.open_joystick, spring)
     emulator.plug()
     return device, emulator, answers
 
@@ -148,6 +155,129 @@ def test_gamepad_has_a_dead_zone_and_others_are_not_listened_to():
     assert device.read().steering == 0
 
 
+def test_g29_drives_while_a_paddle_is_held_and_steers_fully_at_two_thirds_of_the_way():
+    device, emulator, _ = wheel(G29)
+    emulator.axis(0, -0.67)
+    emulator.axis(2, -1.0)
+    assert device.read()[:3] == (-1, 1, False)
+    emulator.hold_button(4)
+    emulator.hold_button(5)
+    emulator.release_button(4)
+    assert device.read().takeover
+    device.hand_back()  # the episode is over: press again
+    assert not device.read().takeover
+    emulator.hold_button(4)
+    assert device.read().takeover
+    emulator.release_button(4)
+    emulator.release_button(5)
+    assert not device.read().takeover
+
+
+@pytest.mark.parametrize("config", [WHEEL, GAMEPAD, G29], ids=["wheel", "gamepad", "g29"])
+@pytest.mark.parametrize("steering", [-1.0, -0.3, 0.0, 0.6, 1.0])
+def test_where_an_axis_is_for_a_steering(config, steering):
+    assert config.steering.value(config.steering.raw(steering)) == pytest.approx(steering)
+
+
+class Haptics:
+    """
+    Stand-in for SDL.
+
+    :param effects: that the wheel offers
+    """
+
+    def __init__(self, effects=SPRING):
+        self.effects, self.centres, self.calls = effects, [], []
+
+    def SDL_JoystickFromInstanceID(self, number):
+        return 1
+
+    def SDL_HapticOpenFromJoystick(self, joystick):
+        return 2
+
+    def SDL_HapticQuery(self, haptic):
+        return self.effects
+
+    def effect(self, effect):
+        condition = effect._obj.condition
+        self.centres.append((condition.center[0] / MOST_RAW, condition.left_sat[0], condition.right_coeff[0]))
+
+    def SDL_HapticNewEffect(self, haptic, effect):
+        self.effect(effect)
+        return 3
+
+    def SDL_HapticUpdateEffect(self, haptic, number, effect):
+        self.effect(effect)
+
+    def __getattr__(self, name):
+        return lambda *arguments: self.calls.append(name)
+
+
+def test_a_spring_turns_the_wheel_to_where_the_novice_steers():
+    haptics = Haptics()
+    device, emulator, _ = wheel(replace(WHEEL, steering=Steering(left=0.9, right=-0.9, dead_zone=0.0)), Spring(0.4, haptics))
+    for steering in (0.5, 0.5, -1.0, None, None, 0.25):
+        device.feel(steering)
+    assert [centre for centre, _, _ in haptics.centres] == pytest.approx([-0.45, 0.9, -0.225], abs=1e-4)
+    assert {(saturation, coefficient) for _, saturation, coefficient in haptics.centres} == {(26214, 13107)}  # 40 %
+    assert haptics.calls.count("SDL_HapticRunEffect") == 3 and haptics.calls.count("SDL_HapticStopEffect") == 1
+    emulator.unplug()
+    device.feel(1.0)
+    assert haptics.calls[-1] == "SDL_HapticClose" and len(haptics.centres) == 3
+    emulator.plug()
+    device.feel(1.0)
+    assert len(haptics.centres) == 4
+
+
+def test_a_wheel_without_a_spring_can_be_driven_with(caplog):
+    haptics = Haptics(effects=1)
+    device, emulator, _ = wheel(WHEEL, Spring(0.4, haptics))
+    assert "offers no spring" in caplog.text and device.read().connected
+    device.feel(0.5)
+    assert haptics.centres == [] and haptics.calls == ["SDL_HapticClose"]
+
+
+def test_sdl_is_reached_and_its_structures_have_its_size():
+    library = sdl()
+    assert library.SDL_HapticOpenFromJoystick(None) is None and b"aptic" in library.SDL_GetError()
+    assert (sizeof(Condition), Condition.center.offset, Condition.length.offset) == (68, 60, 20)  # as its header says
+
+
+def test_the_wheel_follows_the_novice_and_is_free_in_takeovers_and_pauses():
+    haptics = Haptics()
+    device, emulator, _ = wheel(WHEEL, Spring(1.0, haptics))
+    drive = Session(Person(device))
+    window = Window("test")
+    window.drive = drive
+    drive.show(proposed=(0.5, 0.0))
+    window.feel()  # paused
+    assert haptics.centres == []
+    drive.go_on()
+    window.feel()
+    assert len(haptics.centres) == 1
+    emulator.button(4)
+    window.feel()
+    assert haptics.calls[-1] == "SDL_HapticStopEffect"
+    emulator.button(4)
+    drive.show(takeover=True)  # the step under way is the person's still
+    window.feel()
+    assert len(haptics.centres) == 1
+    drive.show(takeover=False)
+    window.feel()
+    assert len(haptics.centres) == 2
+    window.close()
+
+
+def test_keys_are_heard_where_each_frame_takes_too_long(monkeypatch):
+    monkeypatch.setattr(window_module, "FRAME_SECONDS", -1.0)  # the next one is always due
+    window, (_, device, _) = Window("test"), keyboard()
+    drive = Session(Person(device))
+    DeviceEmulator().press(pygame.K_q)
+    window.run(drive, lambda: drive.ended or window.frames > 20)
+    window.close()
+    assert drive.ended
+
+
 def test_calibration_finds_axes_and_is_read_back(tmp_path):
     calibration = Calibration("my wheel")
     person = DeviceEmulator(calibration.handle)
@@ -190,6 +320,7 @@ def test_calibration_asks_again_when_nothing_moved():
         (("centre: 0.0", "centre: 2.0"), "centre must lie between"),
         (("name:", "nam:"), "lacks name"),
         (("dead_zone: 0.02", "dead_zone: 3"), "dead_zone must be"),
+        (("hold: false", "hold: 1"), "hold must be true or false"),
     ],
 )
 def test_a_bad_configuration_is_named(tmp_path, change, message):
@@ -560,6 +691,8 @@ def main_with(monkeypatch, *arguments):
         (["--rate", "0"], "--rate must be from"),
         (["--query", "1.5"], "--query must be above 0"),
         (["--query", "0.9", "--no-meter"], "leave out --no-meter"),
+        (["--force-feedback", "2"], "--force-feedback must be above 0"),
+        (["--force-feedback", "0.3", "--serve", "8000"], "--force-feedback is for a wheel"),
         (["--no-learning"], "--no-learning needs a model"),
         (["--config", "nothing.yml"], "nothing.yml cannot be read"),
         (["--resume", "nowhere"], "there is no such folder"),

@@ -15,6 +15,7 @@ import torch as th
 from sb3_chac.cli.arguments import add_env_kwargs, parse_env_kwargs
 from sb3_chac.cli.command import check_least, command_parser, run_command
 from sb3_chac.cockpit.devices import (
+    G29,
     GAMEPAD,
     WHEEL,
     Calibration,
@@ -22,6 +23,7 @@ from sb3_chac.cockpit.devices import (
     DeviceError,
     Joystick,
     Keyboard,
+    Spring,
     is_wheel,
     load_config,
     save_config,
@@ -60,12 +62,21 @@ def make_parser() -> argparse.ArgumentParser:
     what.add_argument("--pretrain", type=int, default=0, metavar="N", help="gradient steps on it before the drive")
     how = parser.add_argument_group("how it is driven")
     how.add_argument(
-        "--device", default="auto", choices=("auto", "keyboard", "gamepad", "wheel"), help="(default: %(default)s)"
+        "--device",
+        default="auto",
+        choices=("auto", "keyboard", "gamepad", "wheel", "g29"),
+        help="g29: a Logitech G29 as in MetaDrive, drive while a paddle is held (default: %(default)s)",
     )
     how.add_argument("--serve", metavar="[HOST:]PORT", help="no window, but a page to drive in (default host: 127.0.0.1)")
     how.add_argument("--tls-cert", type=Path, metavar="FILE", help="with --serve: encrypt with this certificate (PEM)")
     how.add_argument("--tls-key", type=Path, metavar="FILE", help="its key (PEM), if that is in another file")
     how.add_argument("--config", type=Path, metavar="FILE", help="axes and buttons of gamepad or wheel, see --calibrate")
+    how.add_argument(
+        "--force-feedback",
+        type=float,
+        metavar="SHARE",
+        help="a spring of this share of the wheel's force turns it to where the novice steers, for example 0.3",
+    )
     how.add_argument("--rate", type=float, metavar="HZ", help="steps per second (default: the environment's own real time)")
     how.add_argument(
         "--steering", default="auto", choices=("auto", "left", "right"), help="side of the greatest first action (%(default)s)"
@@ -192,6 +203,8 @@ def check_given(args: argparse.Namespace) -> None:
         raise NotDrivable(f"--rate must be from 0.5 to 100 steps per second, got {args.rate:g}.")
     if args.query is not None and not 0 < args.query <= 1:
         raise NotDrivable(f"--query must be above 0 and at most 1 (for example 0.95), got {args.query:g}.")
+    if args.force_feedback is not None and not 0 < args.force_feedback <= 1:
+        raise NotDrivable(f"--force-feedback must be above 0 and at most 1 (for example 0.3), got {args.force_feedback:g}.")
     if args.no_learning and not args.trained_agent:
         raise NotDrivable("--no-learning needs a model that can drive: -i MODEL.zip.")
     if args.no_takeover and args.algo in ("hg_dagger", "iwr") and not args.trained_agent:
@@ -231,6 +244,8 @@ def check_arguments(args: argparse.Namespace) -> None:
         raise NotDrivable("--tls-cert and --tls-key: both are for --serve, and a key needs its certificate.")
     if args.serve:
         args.serve = parse_address(args.serve)
+    if args.force_feedback is not None and (args.serve or args.device == "keyboard"):
+        raise NotDrivable("--force-feedback is for a wheel at this machine: leave it out with --serve and --device keyboard.")
     if args.device == "keyboard" and args.config:
         raise NotDrivable("--config is for a gamepad or wheel, the keyboard needs none.")
     if args.seed < 0:
@@ -339,7 +354,13 @@ def find_device(args: argparse.Namespace) -> Device:
     if args.device == "auto" and not names:
         return Keyboard()
     wheel = args.device == "wheel" or (args.device == "auto" and is_wheel(names[0]))
-    return Joystick(config or (WHEEL if wheel else GAMEPAD))
+    layout = G29 if args.device == "g29" else WHEEL if wheel else GAMEPAD
+    spring = None
+    if args.force_feedback is not None:
+        spring = Spring(args.force_feedback)
+        if names:
+            spring.attach(pygame.joystick.Joystick(0))  # tells at once if it offers none
+    return Joystick(config or layout, spring=spring)
 
 
 def calibrate(file: Path) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pygame
 
-from sb3_chac.cockpit.devices import Command, Keyboard
+from sb3_chac.cockpit.devices import Command, Joystick, Keyboard
 from sb3_chac.cockpit.session import Display, Session, asks_for_help, indicators, who_drives
 from sb3_chac.envs.driving.display import BLACK, EGO, HUMAN, ORANGE, PANEL, RED, TEXT
 
@@ -35,7 +35,7 @@ KEYBOARD_HELP = (
     ("Space", "take over, hand back"),
 )
 JOYSTICK_HELP = (
-    ("button, paddle", "take over, hand back"),
+    ("button, paddle", "take over, hand back (--device g29: drive while it is held)"),
     ("K", "drive with the keyboard from now on"),
 )
 HELP = (
@@ -91,10 +91,22 @@ class Window:
             if due <= 0 and not 0 < self.drive.time_to_tick() < DRAWING_SECONDS:
                 self._drawn_at = now
                 self.draw()
-                continue
-            first = pygame.event.wait(max(1, int(1000 * due)) if due > 0 else 2)
-            for event in (first, *pygame.event.get()):
+                self.feel()
+                events = pygame.event.get()  # now, for the next frame may be due already where drawing takes long
+            else:
+                events = [pygame.event.wait(max(1, int(1000 * due)) if due > 0 else 2), *pygame.event.get()]
+            for event in events:
                 self.handle(event)
+        if isinstance(drive.person.device, Joystick):
+            drive.person.device.feel(None)
+
+    def feel(self) -> None:
+        """Let a wheel with force feedback follow the novice, while it drives; who drives is not to fight with it."""
+        device, display = self.drive.person.device, self.drive.display
+        if isinstance(device, Joystick):
+            now = self.drive.person.read()
+            follows = now.connected and not now.takeover and not self.drive.paused and who_drives(display, True) == "novice"
+            device.feel(display.proposed[0] if follows else None)
 
     def close(self) -> None:
         """Close the window."""
@@ -208,6 +220,9 @@ class Window:
         end = bar.centerx + round(min(max(value, -1.0), 1.0) * bar.width / 2)
         pygame.draw.rect(self.screen, colour, (min(bar.centerx, end), bar.top, abs(end - bar.centerx), bar.height))
         pygame.draw.line(self.screen, TEXT, (bar.centerx, bar.top - 2), (bar.centerx, bar.bottom + 1))
+        # In the half that is free
+        place, anchor = ((bar.left + 5, bar.centery), "midleft") if value >= 0 else ((bar.right - 5, bar.centery), "midright")
+        self._text(f"{abs(value):.0%}", place, self.small, TEXT, anchor)
         self._text(ends[0], (bar.left - 8, bar.centery), self.small, DIM, "midright")
         self._text(ends[1], (bar.right + 8, bar.centery), self.small, DIM, "midleft")
 

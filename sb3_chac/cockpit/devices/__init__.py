@@ -3,6 +3,7 @@
 from sb3_chac.cockpit.devices.base import Clock, Command, Device, DeviceError, DriverInput
 from sb3_chac.cockpit.devices.calibration import Calibration
 from sb3_chac.cockpit.devices.config import (
+    G29,
     GAMEPAD,
     WHEEL,
     JoystickConfig,
@@ -12,10 +13,12 @@ from sb3_chac.cockpit.devices.config import (
     load_config,
     save_config,
 )
+from sb3_chac.cockpit.devices.feedback import Spring
 from sb3_chac.cockpit.devices.joystick import Joystick
 from sb3_chac.cockpit.devices.keyboard import Keyboard, Ramps
 
 __all__ = [
+    "G29",
     "GAMEPAD",
     "WHEEL",
     "Calibration",
@@ -29,6 +32,7 @@ __all__ = [
     "Keyboard",
     "Pedal",
     "Ramps",
+    "Spring",
     "Steering",
     "is_wheel",
     "load_config",

@@ -39,6 +39,16 @@ class Steering:
         share = min(max(share - self.dead_zone, 0.0) / (1 - self.dead_zone), 1.0)
         return sign * share**self.exponent
 
+    def raw(self, steering: float) -> float:
+        """
+        Convert steering to where the axis is then.
+
+        :param steering: -1 (left) to 1 (right)
+        """
+        share = abs(steering) ** (1 / self.exponent)
+        way = self.dead_zone + (1 - self.dead_zone) * share if share else 0.0
+        return self.centre + way * ((self.right if steering > 0 else self.left) - self.centre)
+
 
 @dataclass(frozen=True)
 class Pedal:
@@ -73,6 +83,7 @@ class JoystickConfig:
     :param takeover: buttons that take over and hand back
     :param pause: buttons that pause and go on
     :param skip: buttons that skip the episode
+    :param hold: whether a takeover lasts as long as its button is held
     """
 
     name: str
@@ -82,6 +93,7 @@ class JoystickConfig:
     takeover: tuple[int, ...]
     pause: tuple[int, ...] = ()
     skip: tuple[int, ...] = ()
+    hold: bool = False
 
 
 # Xbox layout, and Logitech's G29 (both as Linux reports them; 'drive --calibrate' finds out others). A paddle takes over
@@ -89,6 +101,17 @@ GAMEPAD = JoystickConfig(
     "gamepad", Steering(0, dead_zone=0.12, exponent=1.5), Pedal(5, -1.0, 1.0), Pedal(2, -1.0, 1.0), (0,), (7,), (6,)
 )
 WHEEL = JoystickConfig("wheel", Steering(0), Pedal(2, 1.0, -1.0), Pedal(3, 1.0, -1.0), (4, 5), (9,), (8,))
+# The G29 as MetaDrive reads it, the paper's simulator: two thirds of the way are the whole steering, who holds a paddle drives
+G29 = JoystickConfig(
+    "wheel",
+    Steering(0, left=-2 / 3, right=2 / 3, dead_zone=0.0),
+    Pedal(2, 1.0, -1.0, dead_zone=0.0),
+    Pedal(3, 1.0, -1.0, dead_zone=0.0),
+    (4, 5),
+    (9,),
+    (8,),
+    hold=True,
+)
 WHEEL_NAMES = ("wheel", "g25", "g27", "g29", "g920", "g923", "racing", "driving force", "t150", "t248", "t300", "fanatec")
 
 
@@ -111,7 +134,7 @@ def save_config(file: Path, config: JoystickConfig) -> None:
     for part in ("steering", "throttle", "brake"):
         values = vars(getattr(config, part))
         data[part] = {name: round(value, 4) for name, value in values.items()}
-    data |= {name: list(getattr(config, name)) for name in ("takeover", "pause", "skip")}
+    data |= {name: list(getattr(config, name)) for name in ("takeover", "pause", "skip")} | {"hold": config.hold}
     text = "# Written by 'sb3-chac drive --calibrate': raw values of axes in their positions, and numbers of buttons\n"
     file.write_text(text + yaml.safe_dump(data, sort_keys=False))
 
@@ -120,7 +143,7 @@ def load_config(file: Path) -> JoystickConfig:
     """
     Read the configuration of a device.
 
-    :param file: as ``save_config`` writes it; dead zones, exponent, pause and skip may be left out
+    :param file: as ``save_config`` writes it; dead zones, exponent, pause, skip and hold may be left out
     :raises DeviceError: names what is wrong in it
     """
     try:
@@ -133,7 +156,7 @@ def load_config(file: Path) -> JoystickConfig:
         raise DeviceError(
             f"{file} must hold name, steering, throttle, brake and takeover: 'sb3-chac drive --calibrate {file}'."
         )
-    _check_keys(str(file), data, {"name", "steering", "throttle", "brake", "takeover"}, {"pause", "skip"})
+    _check_keys(str(file), data, {"name", "steering", "throttle", "brake", "takeover"}, {"pause", "skip", "hold"})
     parts: dict[str, Any] = {}
     for part, kind in (("steering", Steering), ("throttle", Pedal), ("brake", Pedal)):
         parts[part] = _part(f"{file}: {part}", data[part], kind)
@@ -144,6 +167,9 @@ def load_config(file: Path) -> JoystickConfig:
         parts[name] = tuple(buttons)
     if not parts["takeover"]:
         raise DeviceError(f"{file}: takeover must name a button, without one nobody can take over.")
+    parts["hold"] = data.get("hold", False)
+    if not isinstance(parts["hold"], bool):
+        raise DeviceError(f"{file}: hold must be true or false, got {parts['hold']!r}.")
     return JoystickConfig(str(data["name"]), **parts)
 
 

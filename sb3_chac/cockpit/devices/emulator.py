@@ -96,8 +96,24 @@ class DeviceEmulator:
 
         :param button: number, is pressed and let go
         """
-        for kind in (pygame.JOYBUTTONDOWN, pygame.JOYBUTTONUP):
-            self._post(kind, instance_id=self.joystick.instance_id, button=button)
+        self.hold_button(button)
+        self.release_button(button)
+
+    def hold_button(self, button: int) -> None:
+        """
+        Press a button and hold it.
+
+        :param button: number
+        """
+        self._post(pygame.JOYBUTTONDOWN, instance_id=self.joystick.instance_id, button=button)
+
+    def release_button(self, button: int) -> None:
+        """
+        Let go of a button.
+
+        :param button: number
+        """
+        self._post(pygame.JOYBUTTONUP, instance_id=self.joystick.instance_id, button=button)
 
     def _post(self, kind: int, **values: Any) -> None:
         self.post(pygame.event.Event(kind, **values))
