@@ -231,7 +231,7 @@ def test_a_spring_turns_the_wheel_to_where_the_novice_steers():
 
 def test_a_wheel_without_a_spring_can_be_driven_with(caplog):
     haptics = Haptics(effects=1)
-    device, emulator, _ = wheel(WHEEL, Spring(0.4, haptics))
+    device, _, _ = wheel(WHEEL, Spring(0.4, haptics))
     assert "offers no spring" in caplog.text and device.read().connected
     device.feel(0.5)
     assert haptics.centres == [] and haptics.calls == ["SDL_HapticClose"]
