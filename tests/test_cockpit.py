@@ -10,6 +10,7 @@ from dataclasses import replace
 os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
 
 import gymnasium as gym
+import minari
 import numpy as np
 import pygame
 import pytest
@@ -41,7 +42,7 @@ from sb3_chac.cockpit.devices.feedback import MOST_RAW, SPRING, Condition, sdl
 from sb3_chac.cockpit.driven import driven
 from sb3_chac.cockpit.person import NotDrivable, Person, check_drivable
 from sb3_chac.cockpit.recording import FOLDER
-from sb3_chac.cockpit.session import Session, SessionEnded
+from sb3_chac.cockpit.session import Session, SessionEnded, indicators
 from sb3_chac.cockpit.window import Window
 from sb3_chac.common.checkpoint_files import sound_checkpoint
 from sb3_chac.common.demonstrations import load_demonstrations
@@ -435,6 +436,34 @@ def test_a_skipped_episode_is_truncated(tmp_path):
     assert drive.paused
 
 
+@pytest.mark.parametrize("command, verdict", [(Command.SUCCESS, True), (Command.FAILURE, False), (Command.SKIP, None)])
+def test_the_persons_verdict_ends_the_episode_and_is_stored(command, verdict, tmp_path):
+    env, drive, _ = cockpit(tmp_path, keyboard()[1])
+    records = []
+    env.recorder.on_episode = records.append
+    env.reset(seed=1)
+    env.step(np.zeros(2, np.float32))
+    drive.obey(command)
+    assert env.step(np.zeros(2, np.float32))[2:4] == (False, True)
+    env.reset(seed=2)
+    assert not env.step(np.zeros(2, np.float32))[3]
+    summary = env.recorder.finish()
+    assert [record.verdict for record in records] == [verdict, None]
+    assert (summary.called_success, summary.called_failure) == (verdict is True, verdict is False)
+    first, second = minari.load_dataset(tmp_path / "drive-v0").iterate_episodes()
+    assert first.infos["verdict"].tolist() == [0, 0, {True: 1, False: -1, None: 0}[verdict]]
+    assert not second.infos["verdict"].any()
+
+
+def test_keys_for_a_verdict():
+    window, drive = Window("test"), Session(Person(keyboard()[1]))
+    window.drive = drive
+    for key, wanted in ((pygame.K_g, (True, True)), (pygame.K_f, (True, False)), (pygame.K_n, (True, None))):
+        window.handle(pygame.event.Event(pygame.KEYDOWN, key=key))
+        assert drive.take_skip() == wanted and drive.take_skip() == (False, None)
+    window.close()
+
+
 # Learning beside the drive
 
 
@@ -476,6 +505,36 @@ def test_the_meter_can_be_left_out(meter, tmp_path):
     drive.meter = meter
     model.learn(120)
     assert (drive.display.novice.risk is not None) == meter
+    env.recorder.finish()
+
+
+@pytest.mark.parametrize("algorithm", [PVP, DPVP, CHAC])
+@pytest.mark.parametrize("meter", [True, False])
+def test_a_takeover_tells_what_it_has_taught(algorithm, meter, tmp_path):
+    _, device, person = keyboard()
+    model, drive, env = make_driven(algorithm, tmp_path, device, Car(length=10**6))
+    drive.meter = meter
+    step_of_car = env.step
+
+    def step(action):
+        if drive.totals.total_steps in (60, 75):
+            assert drive.display.novice.lesson is None or drive.totals.total_steps == 75
+            person.tap(pygame.K_SPACE)
+        return step_of_car(action)
+
+    env.step = step
+    model.learn(150)
+    lesson = drive.display.novice.lesson
+    if not meter:
+        assert lesson is None
+    else:
+        observation, person_action, novice_action = model._lesson_of
+        assert observation[0, 1] == 60 and np.allclose(person_action, [[0, 0]]) and 0 <= lesson.alike <= 75
+        assert np.allclose(env.unwrapped.executed[60], [0, 0])
+        now = model._tell_lesson(None)  # the last step may have taught, too
+        values = [model._guided_value(observation, action) for action in (person_action, novice_action)]
+        assert [now.person, now.novice] == pytest.approx(np.subtract(values, model._lesson.before)) and any(now[:2])
+        assert dict(indicators(drive.display, drive.totals, 0))["taught"] == str(lesson)
     env.recorder.finish()
 
 

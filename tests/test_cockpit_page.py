@@ -19,7 +19,7 @@ from sb3_chac.cockpit import access
 from sb3_chac.cockpit import server as server_module
 from sb3_chac.cockpit.address import Address
 from sb3_chac.cockpit.devices.browser import MOMENT, BadMessage, Browser, Held, Wish, parse
-from sb3_chac.cockpit.meter import CALM, LEAST, GuidanceMeter
+from sb3_chac.cockpit.meter import CALM, LEAST, GuidanceMeter, Lesson, LessonMeter
 from sb3_chac.cockpit.session import Display, Novice, Totals, asks_for_help, indicators, who_drives
 from sb3_chac.cockpit.wrapper import STANDS
 from sb3_chac.common.contract import Guidance, TakeoverDisplay
@@ -232,6 +232,15 @@ def test_without_a_threshold_nobody_is_asked():
     assert meter.tell(-1e9) == 1.0 and not meter.asks
 
 
+def test_a_lesson_is_the_change_since_the_takeover_began_and_counts_states_like_it():
+    meter = LessonMeter((0.5, -0.25))
+    assert str(meter.tell((0.5, -0.25), None)) == "+0.00, 0 alike"
+    meter.tell((0.6, -0.3), -0.25)
+    meter.tell((0.6, -0.3), -0.2)
+    assert meter.tell((0.75, -0.5), None) == (0.25, -0.25, 1)
+    assert str(meter.tell((0.75, -0.5), -0.9)) == "+0.50, 2 alike"
+
+
 def test_memory_ends():
     meter = GuidanceMeter(memory=LEAST)
     for value in [1.0] * LEAST + [-1.0] * LEAST:
@@ -327,7 +336,7 @@ def shows(page, element, text):
 @pytest.mark.parametrize("all_sizes", [SIZES, pytest.param(MORE_SIZES, marks=pytest.mark.slow)], ids=["few", "more"])
 def test_nothing_overlaps_or_leaves_the_view_in_any_size(served, all_sizes):
     """With the longest values. Help and options fit as well, and are closed at first."""
-    novice = Novice("2: self-learning", True, 0.97, 1.0, True)
+    novice = Novice("2: self-learning", True, 0.97, 1.0, True, Lesson(12.0, -12.0, 999))
     numbers = {"total_steps": 1_234_567, "human_steps": 1_234_567, "seconds": 123_456.0, "cost": 1234.5, "collisions": 3}
     served.drive.lag = 123_456
     with chromium() as browser:
@@ -448,6 +457,23 @@ def test_the_keyboard_reaches_everything_and_space_stays_with_the_button(served)
         assert not served.drive.ended  # once by mistake is not enough
         page.evaluate(f"() => {{ {press} quit.click(); }}")
         wait_until(lambda: served.drive.ended)
+
+
+@needs_chromium
+def test_the_person_says_how_the_episode_ended(served):
+    records = []
+    served.env.recorder.on_episode = records.append
+    served.drive.corridors = False
+    with chromium() as browser, opened(browser, served, viewport={"width": 844, "height": 390}) as page:
+        page.click("button:has-text('Begin')")
+        page.keyboard.press("KeyG")
+        wait_until(lambda: served.tick() or (records and records[-1].verdict is True))
+        page.click("button:has-text('Options')")
+        page.click("text=show what the policy sees")
+        wait_until(lambda: served.tick() or served.drive.corridors)
+        page.click("text=Episode: failed")
+        wait_until(lambda: served.tick() or records[-1].verdict is False)
+        assert not page.locator("#options").is_visible()
 
 
 @needs_chromium

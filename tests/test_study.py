@@ -32,7 +32,7 @@ from sb3_chac.cockpit.study import SUMMARY, Condition, Participant, Protocol, St
 EXAMPLE = Path(__file__).parents[1] / "examples" / "study" / "protocol.yaml"
 GUIDE = Path(sb3_chac.__file__).parent / "cockpit" / "README.md"
 SHORT = {"episodes": 2, "algo": "pvp", "env_kwargs": {"horizon": 30, "blocks": 1}, "rate": 20}
-RECORD = EpisodeRecord(100, 10, 2, 1.5, 0.5, True, 50.0, 10.0, True)
+RECORD = EpisodeRecord(100, 10, 2, 1.5, 0.5, True, 50.0, 10.0, None, True)
 SCALES = {scale.name: 5 * i for i, scale in enumerate(forms.TLX)}
 
 

@@ -15,8 +15,9 @@ from stable_baselines3.common.policies import BasePolicy
 
 from sb3_chac.chac import CHAC
 from sb3_chac.cockpit.learner import Learner
-from sb3_chac.cockpit.meter import GuidanceMeter
+from sb3_chac.cockpit.meter import GuidanceMeter, Lesson, LessonMeter
 from sb3_chac.cockpit.session import Novice, Session, SessionEnded
+from sb3_chac.common.contract import scale_action
 from sb3_chac.common.critics import DistributionalCritic
 from sb3_chac.common.guided import GuidedOffPolicyAlgorithm
 from sb3_chac.hg_dagger import HGDagger
@@ -59,6 +60,9 @@ class DrivenTraining(Base):
         self._driving_lock = threading.Lock()  # held while the driving policy acts or is refreshed
         self._learner_logger = Logger(None, [])
         self._meter = GuidanceMeter(drive.query)
+        self._lesson: LessonMeter | None = None
+        self._lesson_of: tuple[Any, np.ndarray, np.ndarray] | None = None  # observation, the person's and the novice's action
+        self._is_taken_over = False
         self._driving_policy = copy.deepcopy(self._learning_policy)
         self._pairs = tuple(
             [*policy.parameters(), *policy.buffers()] for policy in (self._driving_policy, self._learning_policy)
@@ -162,8 +166,58 @@ class DrivenTraining(Base):
             None if choice is None else float(choice.confidence[0]),
             risk,
             self._meter.asks,
+            self._tell_lesson(actions),
         )
         self.drive.show(novice=novice)
+
+    def _tell_lesson(self, actions: np.ndarray | None) -> Lesson | None:
+        """
+        Tell what the last takeover has taught by now.
+
+        :param actions: that the novice is about to do, scaled to [-1, 1], shape (1, 2)
+        """
+        if self._lesson is None or self._lesson_of is None:
+            return None
+        observation, person, novice = self._lesson_of
+        now = self._guided_value(observation, person), self._guided_value(observation, novice)
+        proposed = None
+        if actions is not None and not self._is_taken_over:
+            proposed = self._guided_value(self._last_obs, actions)
+        return self._lesson.tell(now, proposed)
+
+    def _begin_lesson(self, novice: np.ndarray, info: dict[str, Any]) -> None:
+        """
+        Note the state in which a takeover begins.
+
+        :param novice: action that it proposed, scaled to [-1, 1], shape (1, 2)
+        :param info: of the step
+        """
+        critic = getattr(self._driving_policy, "critic", None)
+        if critic is None or not self.drive.meter or not self._n_updates:
+            return
+        person = scale_action(info["applied_action"], self.action_space)[None].astype(np.float32)  # type: ignore[arg-type]
+        self._lesson_of = copy.deepcopy(self._last_obs), person, novice
+        with self._driving_lock:
+            self._this_thread.acts = True
+            values = self._guided_value(self._last_obs, person), self._guided_value(self._last_obs, novice)
+            self._this_thread.acts = False
+        self._lesson = LessonMeter(values)
+
+    @th.no_grad()
+    def _guided_value(self, observation: Any, actions: np.ndarray) -> float:
+        """
+        Value of the human-guided policy.
+
+        :param observation: as the environment gives it
+        :param actions: scaled to [-1, 1], shape (1, 2)
+        :return: Q_g, of two critics the smaller one
+        """
+        obs, _ = self.policy.obs_to_tensor(observation)
+        action = th.as_tensor(actions, dtype=th.float32, device=self.device)
+        critic = self.policy.critic
+        if isinstance(critic, DistributionalCritic):
+            return float(critic.pessimistic(obs, action)[0][0])
+        return min(float(q_value[0]) for q_value in critic(obs, action))
 
     def _show_counts(self) -> None:
         steps = {name: int(self.counts[name]) for name in ("total_steps", "human_steps")}
@@ -206,8 +260,12 @@ class DrivenTraining(Base):
     ) -> None:
         if infos[0].get("unattended"):  # nobody's decision: nothing is to be learned from it
             self._forget_episodes()
-            self._last_obs = new_obs
+            self._last_obs, self._is_taken_over = new_obs, False
             return
+        begins = infos[0]["takeover"] and not self._is_taken_over
+        self._is_taken_over = infos[0]["takeover"]
+        if begins:
+            self._begin_lesson(buffer_action, infos[0])
         with self._buffer_lock:
             super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
         self.driven_seconds += self.drive.period
@@ -238,6 +296,7 @@ class DrivenTraining(Base):
 
     def _excluded_save_params(self) -> list[str]:
         own = ["drive", "learner", "_this_thread", "_buffer_lock", "_driving_lock", "_learner_logger", "_driving_policy"]
+        own += ["_meter", "_lesson", "_lesson_of", "_is_taken_over"]
         return [*super()._excluded_save_params(), *own, "_pairs", "_learning_policy", "_callback"]
 
     def save(self, *args: Any, **kwargs: Any) -> None:

@@ -1,6 +1,7 @@
-"""The guidance meter: how much what the novice is about to do needs a person, as the critics tell it."""
+"""What the critics tell a person: how much what the novice is about to do needs help, and what a takeover taught."""
 
 from collections import deque
+from typing import NamedTuple
 
 LEAST = 50  # values from which a rank can be told
 MEMORY = 1000  # values that a new one is compared with
@@ -47,3 +48,39 @@ class GuidanceMeter:
         else:
             self._calm += 1
             self.asks &= self._calm < CALM
+
+
+class Lesson(NamedTuple):
+    """
+    What a takeover taught: how Q_g of the person's action and of the novice's have changed since, where it began.
+    """
+
+    person: float  # change of Q_g
+    novice: float
+    alike: int  # steps since the takeover in which Q_g of what the novice was about to do was not higher than here
+
+    def __str__(self) -> str:
+        change = self.person - self.novice
+        return f"{change:+.{2 if abs(change) < 9.99 else 0}f}, {min(self.alike, 999)} alike"
+
+
+class LessonMeter:
+    """
+    Meter that follows what the last takeover teaches.
+
+    :param values: of the person's and of the novice's action in the state in which it began: Q_g
+    """
+
+    def __init__(self, values: tuple[float, float]) -> None:
+        self.before = values
+        self.alike = 0
+
+    def tell(self, values: tuple[float, float], proposed: float | None) -> Lesson:
+        """
+        Take the values as they are now.
+
+        :param values: as those of the beginning
+        :param proposed: Q_g of what the novice is about to do, None while the person drives
+        """
+        self.alike += proposed is not None and proposed <= self.before[1]
+        return Lesson(values[0] - self.before[0], values[1] - self.before[1], self.alike)

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 FOLDER = "recording"  # of a run, while it is driven
 ABOUT = "drive.json"
 SUMMARY = "summary.json"
+VERDICT = "info/verdict"  # of the person on the episode, with its last step: 1 a success, -1 a failure, 0 not said
 
 
 @dataclass(frozen=True)
@@ -41,6 +42,7 @@ class Summary:
     :param human_cost: that arose while the person drove
     :param successes: episodes that reached their goal, None if the environment does not tell
     :param seconds: [s] of driving, without pauses
+    :param called_success: episodes that the person called a success, likewise ``called_failure``
     """
 
     dataset: str | None
@@ -54,6 +56,8 @@ class Summary:
     human_cost: float
     successes: int | None
     seconds: float
+    called_success: int = 0
+    called_failure: int = 0
 
     def __str__(self) -> str:
         lines = [
@@ -65,6 +69,8 @@ class Summary:
             lines.append(f"  safety cost   {self.cost:g}, {self.human_cost:g} of it while you drove")
         if self.successes is not None:
             lines.append(f"  arrived       {self.successes} of {self.episodes}")
+        if self.called_success or self.called_failure:
+            lines.append(f"  by your word  {self.called_success} successes, {self.called_failure} failures")
         if self.dataset is not None:
             lines.append(f"  dataset       {self.dataset}")
         return "\n".join(lines)
@@ -81,6 +87,7 @@ class EpisodeRecord(NamedTuple):
     success: bool | None
     episode_return: float
     seconds: float  # of driving
+    verdict: bool | None  # of the person
     is_whole: bool  # False if it was cut off: the person quit, or nobody was at the wheel
 
 
@@ -132,13 +139,21 @@ class CrashSafeRecorder:
         self._reset = json.dumps({"seed": seed, "options": options})
 
     def add(
-        self, action: Any, observation: np.ndarray, reward: float, terminated: bool, truncated: bool, info: dict[str, Any]
+        self,
+        action: Any,
+        observation: np.ndarray,
+        reward: float,
+        terminated: bool,
+        truncated: bool,
+        info: dict[str, Any],
+        verdict: bool | None = None,
     ) -> None:
         """
         Record one step.
 
         :param action: what the novice proposed
         :param observation: what followed
+        :param verdict: whether the person calls the episode a success, None if it does not say
         """
         stored = EpisodeRecorder.stored_infos(action, info, self.env.action_space)
         self._steps.append(
@@ -149,6 +164,7 @@ class CrashSafeRecorder:
                 "termination": terminated,
                 "truncation": truncated,
                 **{f"info/{name}": value for name, value in stored.items()},
+                VERDICT: 0 if verdict is None else 1 if verdict else -1,
             }
         )
         if terminated or truncated:
@@ -264,6 +280,7 @@ def _record(columns: dict[str, np.ndarray], seconds_per_step: float, is_whole: b
         None if one.successes is None else bool(one.successes),
         float(columns["reward"].sum()),
         one.seconds,
+        True if one.called_success else False if one.called_failure else None,
         is_whole,
     )
 
@@ -275,6 +292,7 @@ def _summary(episodes: list[dict[str, np.ndarray]], dataset: Path | None, second
     is_measured = bool(episodes) and all("info/cost" in episode for episode in episodes)
     costs = [episode["info/cost"] for episode in episodes] if is_measured else []
     tell_success = bool(episodes) and all("info/is_success" in episode for episode in episodes)
+    verdicts = [int(episode[VERDICT][-1]) for episode in episodes if VERDICT in episode]  # earlier recordings have none
     return Summary(
         dataset=str(dataset) if dataset else None,
         episodes=len(episodes),
@@ -287,4 +305,6 @@ def _summary(episodes: list[dict[str, np.ndarray]], dataset: Path | None, second
         human_cost=float(sum((values * flags).sum() for values, flags in zip(costs, takeovers, strict=False))),
         successes=sum(bool(episode["info/is_success"][-1]) for episode in episodes) if tell_success else None,
         seconds=steps * seconds_per_step,
+        called_success=sum(verdict == 1 for verdict in verdicts),
+        called_failure=sum(verdict == -1 for verdict in verdicts),
     )

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from sb3_chac.cockpit.devices import Command
+from sb3_chac.cockpit.meter import Lesson
 from sb3_chac.cockpit.person import Person
 from sb3_chac.common.contract import Guidance
 
@@ -28,6 +29,7 @@ class Novice:
     :param confidence: C-HAC in stage 2: P(Q_r > Q_g)
     :param risk: rank of the value of what it is about to do, see ``GuidanceMeter``
     :param asks: whether it asks for help
+    :param lesson: what the last takeover taught, None before the first, and for algorithms without Q_g
     """
 
     stage: str = ""
@@ -35,6 +37,7 @@ class Novice:
     confidence: float | None = None
     risk: float | None = None
     asks: bool = False
+    lesson: Lesson | None = None
 
 
 @dataclass(frozen=True)
@@ -118,6 +121,7 @@ class Session:
         self.paused = True
         self.ended = False
         self._skip = False
+        self._verdict: bool | None = None
         self._changed = threading.Condition()
         self._next_tick = time.monotonic()
 
@@ -146,10 +150,14 @@ class Session:
         """Pause, or go on."""
         self.go_on() if self.paused else self.pause()
 
-    def skip(self) -> None:
-        """Make the next step the last of the episode. If it is paused, the next episode waits."""
+    def skip(self, verdict: bool | None = None) -> None:
+        """
+        Make the next step the last of the episode. If it is paused, the next episode waits.
+
+        :param verdict: whether it was a success, None if the person does not say
+        """
         with self._changed:
-            self._skip = True
+            self._skip, self._verdict = True, verdict
             self._changed.notify_all()
 
     def quit(self) -> None:
@@ -169,6 +177,8 @@ class Session:
                 self.toggle_pause()
             case Command.SKIP:
                 self.skip()
+            case Command.SUCCESS | Command.FAILURE:
+                self.skip(verdict=command is Command.SUCCESS)
             case Command.QUIT:
                 self.quit()
             case Command.CORRIDORS if self.corridors is not None:
@@ -202,11 +212,16 @@ class Session:
             self._next_tick = time.monotonic() + self.period
             self._changed.notify_all()
 
-    def take_skip(self) -> bool:
-        """Tell once whether the episode is to end."""
+    def take_skip(self) -> tuple[bool, bool | None]:
+        """
+        Tell once whether the episode is to end.
+
+        :return: whether the episode is to end, and whether the person calls it a success, None if it does not say
+        """
         with self._changed:
-            skip, self._skip = self._skip, False
-        return skip
+            skip, verdict = self._skip, self._verdict
+            self._skip, self._verdict = False, None
+        return skip, verdict
 
     def show(self, **changes: Any) -> None:
         """
@@ -227,7 +242,11 @@ class Session:
     # For those who work beside it
 
     def time_to_tick(self) -> float:
-        """Return the time [s] that is left before the next step, infinite in a pause."""
+        """
+        Return the time that is left before the next step.
+
+        :return: [s] until the next step, infinite in a pause
+        """
         return float("inf") if self.paused else self._next_tick - time.monotonic()
 
     def wait_for_room(self, seconds: float) -> None:
@@ -312,6 +331,7 @@ def indicators(
         ("self-learning", "-" if novice.self_drives is None else acts),
         ("confidence", "-" if novice.confidence is None else f"{novice.confidence:.2f}"),
         ("risk", f"HELP {risk}" if asks_for_help(display, driver) else risk),
+        ("taught", "-" if novice.lesson is None else str(novice.lesson)),
         ("cost", f"{totals.cost:g}"),
         ("episode", f"{totals.episode}"),
         ("updates behind", f"{lag}" if lag else "none"),

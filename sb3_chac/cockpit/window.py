@@ -25,6 +25,8 @@ COLOURS = {"person": HUMAN, "brake": RED, "novice": EGO}  # of who drives
 COMMANDS = {
     pygame.K_p: Command.PAUSE,
     pygame.K_n: Command.SKIP,
+    pygame.K_g: Command.SUCCESS,
+    pygame.K_f: Command.FAILURE,
     pygame.K_q: Command.QUIT,
     pygame.K_c: Command.CORRIDORS,
     pygame.K_h: Command.HELP,
@@ -41,6 +43,7 @@ JOYSTICK_HELP = (
 HELP = (
     ("P", "pause, go on"),
     ("N", "next episode: skip this one"),
+    ("G, F", "good or failed: end the episode, and say how it went"),
     ("Q", "quit, with a checkpoint to resume from"),
     ("C", "what the policy sees: how far ways ahead are free"),
     ("H", "this help"),
@@ -181,7 +184,7 @@ class Window:
                 colour = ORANGE
             self._text(name, (SIDE.left + 24, y), self.font, DIM)
             self._text(value, (SIDE.right - 16, y), self.font, colour, "topright")
-            y += 33
+            y += 31
             share = {"confidence": display.novice.confidence, "risk": display.novice.risk, "route": display.route}.get(name)
             if share is not None:
                 bar = pygame.Rect(SIDE.left + 24, y - 8, SIDE.width - 40, 10)
@@ -189,7 +192,7 @@ class Window:
                 filled = bar.copy()
                 filled.width = round(bar.width * share)
                 pygame.draw.rect(self.screen, BARS[name], filled, border_radius=3)
-                y += 14
+                y += 13
         device = self.drive.person.device
         self._text(f"device: {device.name}", (SIDE.left + 24, SIDE.bottom - 56), self.small, DIM)
         self._text("H: help", (SIDE.left + 24, SIDE.bottom - 30), self.small, DIM)

@@ -67,9 +67,10 @@ class Cockpit(gym.Wrapper):
             drive.pause(lost_message(person.device.name))
         proposed = np.array(action)  # the environment may change what it is given
         observation, reward, terminated, truncated, info = self.env.step(action)
-        truncated = truncated or (drive.take_skip() and not terminated)
+        skips, verdict = drive.take_skip()
+        truncated = truncated or (skips and not terminated)
         self.steps += 1
-        self.recorder.add(proposed, observation, float(reward), terminated, truncated, info)
+        self.recorder.add(proposed, observation, float(reward), terminated, truncated, info, verdict)
         drive.count(
             cost=drive.totals.cost + (number_in(info, "cost", 0) or 0.0),
             collisions=drive.totals.collisions + self._has_collided(info),

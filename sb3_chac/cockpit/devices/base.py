@@ -27,6 +27,8 @@ class Command(StrEnum):
 
     PAUSE = "pause"  # or go on
     SKIP = "skip"  # to the next episode
+    SUCCESS = "success"  # ends the episode, and says how
+    FAILURE = "failure"
     QUIT = "quit"
     CORRIDORS = "corridors"  # to be painted, or not
     HELP = "help"

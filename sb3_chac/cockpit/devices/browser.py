@@ -8,8 +8,8 @@ from typing import Any, Literal, NamedTuple
 from sb3_chac.cockpit.devices import GAMEPAD, Clock, Command, DriverInput, Pedal, Ramps
 
 KEYS = {"left", "right", "up", "down"}
-WISHES = {"pause", "skip", "quit", "corridors", "takeover", "wheel", "hand_over", "away"}
-COMMANDS = {command.value: command for command in (Command.PAUSE, Command.SKIP, Command.QUIT, Command.CORRIDORS)}
+WISHES = {"pause", "skip", "success", "failure", "quit", "corridors", "takeover", "wheel", "hand_over", "away"}
+COMMANDS: dict[str, Command] = {command.value: command for command in Command if command.value in WISHES}
 STALE = 0.3  # [s] without a message; the page sends every 50 ms
 TRIGGER = Pedal(0, 0.0, 1.0)  # as browsers report them
 MOMENT = 1.0  # [s] from the last touch until a takeover that began with one is handed back
@@ -33,7 +33,7 @@ class Held(NamedTuple):
 class Wish(NamedTuple):
     """Anything else that the page asks for; ``number`` is that of a ping."""
 
-    name: Literal["pause", "skip", "quit", "corridors", "takeover", "wheel", "hand_over", "away", "ping"]
+    name: Literal["pause", "skip", "success", "failure", "quit", "corridors", "takeover", "wheel", "hand_over", "away", "ping"]
     number: int = 0
 
 

@@ -87,8 +87,7 @@ class Spring:
             if haptic:
                 self.sdl.SDL_HapticClose(ctypes.c_void_p(haptic))
             raise DeviceError(
-                f"--force-feedback: {joystick.get_name()} or its driver offers no spring: leave it out, or use a driver "
-                "that does."
+                f"--force-feedback: {joystick.get_name()} or its driver offers no spring: leave it out, or use another driver."
             )
         self._haptic = ctypes.c_void_p(haptic)
 

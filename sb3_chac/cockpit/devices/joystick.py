@@ -16,8 +16,8 @@ logger = logging.getLogger(__name__)
 class Joystick:
     """
     A gamepad or a steering wheel with pedals: all that SDL calls a joystick. The first one that is plugged in is taken. A
-    button takes over and hands back, or drives as long as it is held. Axes that were not moved yet count as centred,
-    pedals as released.
+    button takes over and hands back, or drives as long as it is held. Axes that were not moved yet count as centred, pedals as
+    released.
 
     :param config: what its axes and buttons do
     :param clock: [s]

@@ -11,7 +11,7 @@ const KEYS = {
   ArrowLeft: "left", KeyA: "left", ArrowRight: "right", KeyD: "right",
   ArrowUp: "up", KeyW: "up", ArrowDown: "down", KeyS: "down",
 };
-const WISHES = { Space: "takeover", KeyP: "pause", KeyN: "skip", KeyQ: "quit", KeyC: "corridors" };
+const WISHES = { Space: "takeover", KeyP: "pause", KeyN: "skip", KeyQ: "quit", KeyC: "corridors", KeyG: "success", KeyF: "failure" };
 const METERS = ["route", "confidence", "risk"]; // indicators with a bar
 const BUTTONS = { 0: "takeover", 9: "pause", 8: "skip" }; // of a gamepad with the standard mapping
 const ROLES = {
@@ -292,13 +292,16 @@ function bar(row, name) {
   outer.setAttribute("aria-valuemax", 1);
   outer.setAttribute("aria-valuenow", 0);
   const inner = document.createElement("div");
-  outer.append(inner);
+  const number = document.createElement("span");
+  outer.append(inner, number);
   row.append(outer);
   return (value) => {
     const share = 50 * clamp(value);
     inner.style.left = `${50 + Math.min(share, 0)}%`;
     inner.style.width = `${Math.abs(share)}%`;
     outer.setAttribute("aria-valuenow", value.toFixed(2));
+    setText(number, `${Math.round(100 * Math.abs(value))} %`);
+    number.style.textAlign = value < 0 ? "right" : "left"; // in the half that is free
   };
 }
 
