@@ -1,4 +1,4 @@
-"""The meter: what the critics tell a person: how much what the novice is about to do needs help, and what a takeover taught."""
+"""Meters of the critics for a person: how much the novice needs help, and what a takeover taught."""
 
 from collections import deque
 from typing import NamedTuple
@@ -52,7 +52,7 @@ class GuidanceMeter:
 
 class Lesson(NamedTuple):
     """
-    Result of a takeover: what a takeover taught: how Q_g of the person's action and of the novice's have changed since, where it began.
+    Result of a takeover: how Q_g of the person's action and of the novice's have changed since, where it began.
     """
 
     person: float  # change of Q_g
